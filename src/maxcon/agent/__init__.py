@@ -1,0 +1,1 @@
+"""The learned Q-function: network, inference without torch, training, shipped weights."""

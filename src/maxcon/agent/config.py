@@ -1,0 +1,159 @@
+"""What an agent is made of and how it is trained: every choice in one place, written into its model card.
+
+`paper()` is the agent strictly as the paper writes it. Every field marked "departure n" is explained, with what it
+bought, under that number in docs/deviations.md, and can be switched off on its own.
+"""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass, field, fields, replace
+from typing import Any
+
+from maxcon.tree.encoding import CHANNELS, PAPER_CHANNELS
+
+
+@dataclass(frozen=True)
+class NetworkConfig:
+    """The Q-network (section 3.4).
+
+    Attributes
+    ----------
+    widths
+        Output width of each EdgeConv layer; the layers' outputs are concatenated.
+    neighbours
+        How many nearest neighbours in H, the point itself included, each point looks at.
+    global_width
+        Width of the global feature.
+    head
+        Hidden widths of the MLP on [point feature, global feature].
+    channels
+        Which channels the state has besides H; departure 1 adds "ratio", "level" and "multiplier".
+    canonical
+        Departure 2: H in a form that does not depend on the units of the data.
+    """
+
+    widths: tuple[int, ...] = (32, 32, 64)
+    neighbours: int = 10
+    global_width: int = 64
+    head: tuple[int, ...] = (64, 32)
+    channels: tuple[str, ...] = CHANNELS
+    canonical: bool = True
+
+
+@dataclass(frozen=True)
+class TrainConfig:
+    """Algorithm 1 and its settings.
+
+    Attributes
+    ----------
+    n_points, n_params
+        Size of the training instances (N, d).
+    low_rate, high_rate
+        The outlier rate of each instance is uniform in this range (section 3.5).
+    n_instances
+        How many instances the training set holds.
+    updates
+        How many gradient steps are made.
+    batch, memory
+        Batch size, and how many transitions the replay memory holds.
+    discount
+        The discount factor gamma (the paper gives none; 1 counts removals).
+    learning_rate, final_learning_rate
+        Adam's step size, from first to last (cosine).
+    exploration, final_exploration
+        epsilon of the epsilon-greedy policy, falling linearly over the first half of the training.
+    reward_scale
+        The reward of a step is minus this; a change of unit that suits Huber's loss.
+    clip
+        Largest norm of a gradient, 0 for none.
+    n_episodes
+        Departure 3: how many episodes run side by side; an update is made after each has made a step.
+    target_every
+        Departure 4: the target network is copied every so many updates; 0 for no target network.
+    n_step
+        Departure 5: the target looks so many steps ahead.
+    double
+        Departure 6: the online network chooses, the target network values (double Q-learning).
+    seed
+        Seeds everything.
+    """
+
+    n_points: int = 100
+    n_params: int = 2
+    low_rate: float = 0.01
+    high_rate: float = 0.40
+    n_instances: int = 4000
+    updates: int = 20000
+    batch: int = 64
+    memory: int = 60000
+    discount: float = 1.0
+    learning_rate: float = 1e-3
+    final_learning_rate: float = 2e-5
+    exploration: float = 0.5
+    final_exploration: float = 0.03
+    reward_scale: float = 0.1
+    clip: float = 5.0
+    n_episodes: int = 16
+    target_every: int = 100
+    n_step: int = 5
+    double: bool = True
+    seed: int = 0
+
+
+@dataclass(frozen=True)
+class AgentConfig:
+    """Network and training together."""
+
+    network: NetworkConfig = field(default_factory=NetworkConfig)
+    train: TrainConfig = field(default_factory=TrainConfig)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return nested plain dictionaries, for JSON."""
+        return asdict(self)
+
+    @classmethod
+    def from_dict(cls, values: dict[str, Any]) -> AgentConfig:
+        """Return the configuration that `to_dict` made `values` of."""
+
+        def build(kind: type[Any], entries: dict[str, Any]) -> Any:
+            known = {each.name for each in fields(kind)}
+            return kind(**{k: tuple(v) if isinstance(v, list) else v for k, v in entries.items() if k in known})
+
+        return cls(build(NetworkConfig, values["network"]), build(TrainConfig, values["train"]))
+
+    def override(self, **changes: Any) -> AgentConfig:
+        """Return a copy with the named fields, of the network or of the training, changed.
+
+        Raises
+        ------
+        TypeError
+            If no field has the name.
+        """
+        network_names = {each.name for each in fields(NetworkConfig)}
+        train_names = {each.name for each in fields(TrainConfig)}
+        unknown = set(changes) - network_names - train_names
+        if unknown:
+            raise TypeError(f"unknown setting {sorted(unknown)[0]!r}; settings are {sorted(network_names | train_names)}")
+        return AgentConfig(
+            replace(self.network, **{k: v for k, v in changes.items() if k in network_names}),
+            replace(self.train, **{k: v for k, v in changes.items() if k in train_names}),
+        )
+
+
+def shipped(n_params: int, seed: int = 0) -> AgentConfig:
+    """Return the configuration of the agents that the package ships."""
+    return AgentConfig().override(n_params=n_params, seed=seed)
+
+
+def paper(n_params: int, seed: int = 0) -> AgentConfig:
+    """Return the agent strictly as the paper writes it: every numbered departure switched off."""
+    return AgentConfig().override(
+        n_params=n_params,
+        seed=seed,
+        channels=PAPER_CHANNELS,
+        canonical=False,
+        n_episodes=1,
+        target_every=0,
+        n_step=1,
+        double=False,
+    )

@@ -1,0 +1,223 @@
+"""Training as a run in a folder: logs, a progress bar with the held-out gap, checkpoints that resume exactly.
+
+A run folder holds ``config.json``, ``log.jsonl`` (a line a report), TensorBoard's event files, ``checkpoint.pt`` (everything
+that changes, replaced atomically) and, when the run has ended, ``agent.safetensors``.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
+
+from maxcon.agent.config import AgentConfig
+from maxcon.agent.learn import Learner, TrainingSet
+from maxcon.agent.weights import save_weights
+from maxcon.tree.batch import BatchEnvironment
+
+
+@dataclass(frozen=True, eq=False)
+class HeldOut:
+    """Instances never trained on, with the consensus that each should reach.
+
+    Attributes
+    ----------
+    data
+        The instances.
+    reference
+        Shape (M,): the optimum, or the best consensus known.
+    rate
+        Shape (M,): the outlier rate of each, by which the gap is reported.
+    """
+
+    data: TrainingSet
+    reference: NDArray[np.int64]
+    rate: NDArray[np.float64]
+
+
+def held_out_gap(learner: Learner, held_out: HeldOut) -> dict[float, float]:
+    """Return the mean gap of the greedy policy, before any refinement, at each outlier rate."""
+    n = len(held_out.reference)
+    environment = BatchEnvironment(held_out.data.instances, n)
+    environment.reset(np.arange(n), np.arange(n))
+    data, learner.data = learner.data, held_out.data
+    try:
+        with torch.no_grad():
+            while not environment.done.all():
+                environment.step(learner.q_values(learner.network, environment).argmax(dim=1).numpy())
+    finally:
+        learner.data = data
+    gap = held_out.reference - environment.gain.sum(axis=1)
+    return {float(rate): float(gap[held_out.rate == rate].mean()) for rate in np.unique(held_out.rate)}
+
+
+def train(
+    config: AgentConfig,
+    data: TrainingSet,
+    held_out: HeldOut,
+    folder: Path,
+    *,
+    report_every: int = 500,
+    checkpoint_seconds: float = 30.0,
+    progress: bool = True,
+) -> Learner:
+    """Train an agent, or go on with the training that `folder` holds; return it where it stands.
+
+    Ctrl-C ends the training after the running update and keeps the checkpoint: called again, it goes on from
+    there to the same result as if it had never been stopped.
+
+    Raises
+    ------
+    ValueError
+        If `folder` holds a run with another configuration.
+    """
+    torch.set_num_threads(1)
+    folder.mkdir(parents=True, exist_ok=True)
+    _claim(folder, config)
+    learner = Learner(data, config)
+    if (folder / "checkpoint.pt").exists():
+        load_checkpoint(learner, folder / "checkpoint.pt")
+    log = _Log(folder, learner.updates)
+    saved = time.perf_counter()
+    losses: list[float] = []
+    total = config.train.updates
+    with _stop_on_interrupt() as stopped, _bar(progress, total, learner.updates) as bar:
+        while learner.updates < total and not stopped.is_set():
+            loss = learner.iterate()
+            if np.isfinite(loss):
+                losses.append(loss)
+            if losses and (learner.updates % report_every == 0 or learner.updates == total):
+                gaps = held_out_gap(learner, held_out)
+                log.write(learner, float(np.mean(losses)), gaps)
+                bar(learner.updates, gaps)
+                losses.clear()
+            elif learner.updates % 20 == 0:
+                bar(learner.updates, None)
+            if time.perf_counter() - saved > checkpoint_seconds:
+                save_checkpoint(learner, folder / "checkpoint.pt")
+                saved = time.perf_counter()
+    save_checkpoint(learner, folder / "checkpoint.pt")
+    log.close()
+    if learner.updates >= total:
+        save_weights(learner.network, config, folder / "agent.safetensors")
+    return learner
+
+
+def save_checkpoint(learner: Learner, path: Path) -> None:
+    """Write everything that changes during training; a kill at any moment leaves the old file or the new one."""
+    state = {
+        "updates": learner.updates,
+        "network": learner.network.state_dict(),
+        "target": learner.target.state_dict(),
+        "optimizer": learner.optimizer.state_dict(),
+        "rng": learner.rng.bit_generator.state,
+        "environment": _tensors(learner.environment.snapshot()),
+        "memory": _tensors(learner.memory.snapshot()),
+    }
+    part = path.with_suffix(".part")
+    torch.save(state, part)
+    os.replace(part, path)
+
+
+def load_checkpoint(learner: Learner, path: Path) -> None:
+    """Put `learner` back where `save_checkpoint` found it."""
+    state: dict[str, Any] = torch.load(path, weights_only=True)
+    learner.updates = state["updates"]
+    learner.network.load_state_dict(state["network"])
+    learner.target.load_state_dict(state["target"])
+    learner.optimizer.load_state_dict(state["optimizer"])
+    learner.rng.bit_generator.state = state["rng"]
+    learner.environment.restore({name: value.numpy() for name, value in state["environment"].items()})
+    learner.memory.restore({name: value.numpy() for name, value in state["memory"].items()})
+
+
+def _tensors(arrays: dict[str, NDArray[Any]]) -> dict[str, torch.Tensor]:
+    return {name: torch.from_numpy(np.ascontiguousarray(value)) for name, value in arrays.items()}
+
+
+def _claim(folder: Path, config: AgentConfig) -> None:
+    """Write the configuration into a new run folder, or make sure that an old one has the same."""
+    path = folder / "config.json"
+    text = json.dumps(config.to_dict(), indent=2, sort_keys=True)
+    if path.exists():
+        if path.read_text(encoding="utf-8") != text:
+            raise ValueError(f"folder holds a run with another configuration ({path}); name a new folder")
+    else:
+        path.write_text(text, encoding="utf-8")
+
+
+class _Log:
+    """TensorBoard events and JSON lines; lines later than the checkpoint that is resumed from are dropped."""
+
+    def __init__(self, folder: Path, updates: int) -> None:
+        from torch.utils.tensorboard import SummaryWriter  # noqa: PLC0415  (a second to import)
+
+        self.path = folder / "log.jsonl"
+        if self.path.exists():
+            lines = [line for line in self.path.read_text(encoding="utf-8").splitlines() if line.endswith("}")]
+            kept = [line for line in lines if json.loads(line)["updates"] <= updates]
+            self.path.write_text("".join(line + "\n" for line in kept), encoding="utf-8")
+        self.board = SummaryWriter(str(folder), purge_step=updates + 1)  # type: ignore[no-untyped-call]
+        self.began = time.perf_counter()
+
+    def write(self, learner: Learner, loss: float, gaps: dict[float, float]) -> None:
+        entry = {
+            "updates": learner.updates,
+            "seconds": round(time.perf_counter() - self.began, 1),
+            "loss": loss,
+            "gap": {f"{rate:.2f}": gap for rate, gap in gaps.items()},
+        }
+        with self.path.open("a", encoding="utf-8") as file:
+            file.write(json.dumps(entry) + "\n")
+        self.board.add_scalar("loss", loss, learner.updates)  # type: ignore[no-untyped-call]
+        for rate, gap in gaps.items():
+            self.board.add_scalar(f"held-out gap/{rate:.2f}", gap, learner.updates)  # type: ignore[no-untyped-call]
+
+    def close(self) -> None:
+        self.board.close()  # type: ignore[no-untyped-call]
+
+
+@contextmanager
+def _bar(show: bool, total: int, done: int) -> Iterator[Any]:
+    columns = (
+        TextColumn("training"),
+        BarColumn(),
+        TextColumn("{task.completed:.0f}/{task.total:.0f} updates"),
+        TimeRemainingColumn(),
+        TextColumn("held-out gap {task.fields[gap]}"),
+    )
+    with Progress(*columns, disable=not show) as display:
+        task = display.add_task("training", total=total, completed=done, gap="-")
+
+        def advance(updates: int, gaps: dict[float, float] | None) -> None:
+            display.update(task, completed=updates)
+            if gaps is not None:
+                display.update(task, gap=", ".join(f"{gap:.2f} at {rate:.0%}" for rate, gap in gaps.items()))
+
+        yield advance
+
+
+@contextmanager
+def _stop_on_interrupt() -> Iterator[threading.Event]:
+    """Turn Ctrl-C into a flag, so that no update is cut in half."""
+    stopped = threading.Event()
+    if threading.current_thread() is not threading.main_thread():
+        yield stopped
+        return
+    before = signal.signal(signal.SIGINT, lambda *_: stopped.set())
+    try:
+        yield stopped
+    finally:
+        signal.signal(signal.SIGINT, before)

@@ -1,0 +1,187 @@
+"""The front door: `maxcon.fit`, the table of methods, and the choice behind "auto"."""
+
+from __future__ import annotations
+
+import inspect
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from importlib import import_module
+from typing import Any
+
+import numpy as np
+
+from maxcon.problem import Consensus, LinearProblem, check_threshold
+from maxcon.problem.validate import check_number
+from maxcon.search.anytime import Method, Progress, Refiner, make_task, run
+from maxcon.search.conclusion import conclude
+
+
+@dataclass(frozen=True)
+class MethodEntry:
+    """A row of the table of methods.
+
+    Attributes
+    ----------
+    home
+        Module and function, imported when first used.
+    summary
+        One line for people.
+    """
+
+    home: str
+    summary: str
+
+    def load(self) -> Method:
+        """Return the generator function."""
+        module, function = self.home.split(":")
+        method: Method = getattr(import_module(module), function)
+        return method
+
+
+METHODS: dict[str, MethodEntry] = {
+    "agent": MethodEntry(
+        "maxcon.search.agent_removal:agent_removal",
+        "the paper's method: a learned agent removes basis points until the rest fits",
+    ),
+    "greedy": MethodEntry(
+        "maxcon.search.removal:greedy", "removes the basis point whose removal lowers f(S) the most, until the rest fits"
+    ),
+    "random": MethodEntry(
+        "maxcon.search.removal:random_removal", "removes random basis points until the rest fits (the paper's RB)"
+    ),
+    "exact": MethodEntry("maxcon.search.sweep:exact_sweep", "the proven optimum, for d = 2: sweeps the arrangement of lines"),
+}
+
+REFINERS: dict[str, str] = {
+    "tree": "maxcon.search.refine:tree_refinement",
+    "swap": "maxcon.search.refine:swap_refinement",
+}
+
+
+def fit(
+    problem: LinearProblem,
+    threshold: float,
+    *,
+    method: str = "auto",
+    rng: int | np.random.Generator | None = None,
+    time_limit: float | None = None,
+    refine: str | None = "swap",
+    gap: int = 0,
+    callback: Callable[[Progress], object] | None = None,
+    **options: Any,
+) -> Consensus:
+    """Find a model that explains as many points as possible within the threshold.
+
+    Parameters
+    ----------
+    problem
+        The points: `maxcon.line`, `maxcon.plane`, `maxcon.hyperplane` or `maxcon.LinearProblem`.
+    threshold
+        The largest residual of an inlier, in the unit of b.
+    method
+        "auto", or a name from `maxcon.methods`.
+    rng
+        A seed or a NumPy generator. None stands for the seed 0: the same data get the same answer.
+    time_limit
+        Seconds after which the best so far is returned; None for no limit.
+    refine
+        What improves each set that the method finds: "tree" is local tree refinement (paper, Algorithm 2),
+        "swap" also tries to give up one point for several, None does nothing.
+    gap
+        Stop as soon as the best found is proven to be within so many inliers of the largest possible.
+    callback
+        Called with a `Progress` whenever the best set or the bound improves; a true return value stops the fit.
+    **options
+        Options of the method.
+
+    Returns
+    -------
+    Consensus
+        The best found until the method ended, the gap was reached, the time was over, the callback asked to stop, or
+        Ctrl-C was pressed.
+
+    Raises
+    ------
+    TypeError
+        If an argument has the wrong type, or the method has no option of a given name.
+    ValueError
+        If an argument is out of its range; the message names it.
+    """
+    began = time.perf_counter()
+    if not isinstance(problem, LinearProblem):
+        raise TypeError(f"problem must be a LinearProblem, but it is a {type(problem).__name__}")
+    threshold = check_threshold(threshold)
+    generator, seed = _check_rng(rng)
+    _check_time_limit(time_limit)
+    if isinstance(gap, bool) or not isinstance(gap, (int, np.integer)):
+        raise TypeError(f"gap must be a whole number, but it is {gap!r}")
+    if gap < 0:
+        raise ValueError(f"gap must be at least 0, but it is {gap}")
+    if callback is not None and not callable(callback):
+        raise TypeError(f"callback must be callable, but it is a {type(callback).__name__}")
+    refiner = _check_refine(refine)
+    name = choose_method(problem) if method == "auto" else _check_method(method)
+    function = METHODS[name].load()
+    _check_options(name, function, options)
+
+    task = make_task(problem, threshold, generator, time_limit, int(gap))
+    best = run(task, function(task, **options), refiner, callback)
+    return conclude(task, best, name, seed, time.perf_counter() - began)
+
+
+def methods() -> dict[str, str]:
+    """Return the name of every method with one line on what it does."""
+    return {name: entry.summary for name, entry in METHODS.items()}
+
+
+def choose_method(problem: LinearProblem) -> str:
+    """Return what "auto" means for `problem`: the proven optimum where it is cheap, else what finds most."""
+    if problem.n_params == 2:
+        return "exact"
+    return "agent" if problem.family == "plane" else "greedy"
+
+
+def _check_rng(rng: Any) -> tuple[np.random.Generator, int | None]:
+    if isinstance(rng, np.random.Generator):
+        return rng, None
+    if rng is None:
+        return np.random.default_rng(0), 0
+    if isinstance(rng, bool) or not isinstance(rng, (int, np.integer)):
+        raise TypeError(f"rng must be None, a seed or a numpy Generator, but it is {rng!r}")
+    if rng < 0:
+        raise ValueError(f"rng must be a seed of at least 0, but it is {rng}")
+    return np.random.default_rng(int(rng)), int(rng)
+
+
+def _check_time_limit(time_limit: Any) -> None:
+    if time_limit is not None and not check_number(time_limit, "time_limit") > 0:
+        raise ValueError(f"time_limit must be a positive number of seconds or None, but it is {time_limit}")
+
+
+def _check_refine(refine: Any) -> Refiner | None:
+    if refine is None:
+        return None
+    if not isinstance(refine, str):
+        raise TypeError(f"refine must be 'tree', 'swap' or None, but it is {refine!r}")
+    if refine not in REFINERS:
+        raise ValueError(f"refine must be 'tree', 'swap' or None, but it is {refine!r}")
+    module, function = REFINERS[refine].split(":")
+    refiner: Refiner = getattr(import_module(module), function)
+    return refiner
+
+
+def _check_method(method: Any) -> str:
+    if not isinstance(method, str):
+        raise TypeError(f"method must be a string, but it is {method!r}")
+    if method not in METHODS:
+        raise ValueError(f"method must be 'auto' or one of {', '.join(METHODS)}, but it is {method!r}")
+    return method
+
+
+def _check_options(name: str, function: Method, options: dict[str, Any]) -> None:
+    known = list(inspect.signature(function).parameters)[1:]
+    for option in options:
+        if option not in known:
+            has = f"its options are {', '.join(known)}" if known else "it has none"
+            raise TypeError(f"unknown option {option!r} for method {name!r}: {has}")

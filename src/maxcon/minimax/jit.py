@@ -1,0 +1,74 @@
+"""How kernels are compiled: one decorator, cached on disk, honest about the first wait."""
+
+from __future__ import annotations
+
+import hashlib
+import re
+import sys
+from collections.abc import Callable
+from functools import cache
+from pathlib import Path
+from typing import Any, TypeVar, cast
+
+import numba
+from numba.core import config, event
+
+F = TypeVar("F", bound=Callable[..., Any])
+
+_PACKAGE = Path(__file__).resolve().parents[1]
+
+
+_IMPORT = re.compile(r"^\s*(?:from|import) maxcon\.([\w.]+)", re.MULTILINE)
+
+
+@cache
+def _digest(module: str) -> str:
+    """Return a digest of a module of the package and of all that it imports from the package.
+
+    Numba notices a change only in the file that holds a kernel, not in the files that the kernel calls
+    into. With this digest as the stamp of its cache, no kernel outlives a change anywhere below it.
+    """
+    seen: dict[str, str] = {}
+    waiting = [module]
+    while waiting:
+        name = waiting.pop()
+        path = _PACKAGE.joinpath(*name.split("."))
+        source = path.with_suffix(".py") if path.with_suffix(".py").exists() else path / "__init__.py"
+        if name in seen or not source.exists():
+            continue
+        seen[name] = source.read_text(encoding="utf-8")
+        waiting += _IMPORT.findall(seen[name])
+    return hashlib.sha256("".join(seen[name] for name in sorted(seen)).encode()).hexdigest()
+
+
+def kernel(function: F) -> F:
+    """Compile `function` with numba: no Python objects, no GIL, no fastmath, cached on disk.
+
+    The cache lies beside the source, or, where that folder is read-only, in the user's cache folder
+    (numba chooses). With ``NUMBA_DISABLE_JIT=1`` the function is returned as it is.
+    """
+    dispatcher = numba.njit(cache=True, nogil=True, error_model="numpy")(function)
+    cache_file = getattr(getattr(dispatcher, "_cache", None), "_cache_file", None)
+    if cache_file is not None:
+        cache_file._source_stamp = _digest(function.__module__.removeprefix("maxcon."))
+    return cast(F, dispatcher)
+
+
+class _FirstCompilation(event.Listener):  # type: ignore[misc]
+    """Says once, on stderr, why the first call takes long."""
+
+    said = False
+
+    def on_start(self, event: Any) -> None:
+        dispatcher = event.data.get("dispatcher")
+        module = getattr(getattr(dispatcher, "py_func", None), "__module__", "")
+        if not self.said and module.startswith("maxcon."):
+            self.said = True
+            print("maxcon: compiling its kernels for this machine (once; they are kept on disk) ...", file=sys.stderr)
+
+    def on_end(self, event: Any) -> None:
+        return
+
+
+if not config.DISABLE_JIT:
+    event.register("numba:compile", _FirstCompilation())

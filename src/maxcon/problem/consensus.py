@@ -1,0 +1,67 @@
+"""The one result type of the package."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+Status = Literal["optimal", "bounded", "heuristic", "infeasible"]
+
+
+@dataclass(frozen=True, eq=False)
+class Consensus:
+    """A model, the points that it explains within the threshold, and how good that is.
+
+    Attributes
+    ----------
+    model
+        Shape (d,): the minimax fit of the inliers. All NaN if `status` is "infeasible".
+    inlier_mask
+        Shape (N,), bool: ``residuals <= threshold``, with the package's slack for rounding.
+    n_inliers
+        The consensus: how many points are inliers.
+    upper_bound
+        No model has more inliers than this (N where nothing is known).
+    gap
+        ``upper_bound - n_inliers``.
+    status
+        "optimal": proven to be the largest; "bounded": an upper bound below N is proven; "heuristic":
+        nothing is proven; "infeasible": no model was found.
+    residuals
+        Shape (N,): the residual of every point under `model`.
+    basis
+        Indices of the inliers that hold the minimax fit in place, at most d + 1.
+    path
+        Indices of the points that the search removed, in order; empty for methods that remove none.
+    threshold
+        The inlier threshold that was asked for.
+    method
+        The name of the method that found it.
+    seed
+        What seeded the random numbers, or None where none were drawn or a generator was passed.
+    seconds
+        Wall-clock time of the fit.
+    """
+
+    model: NDArray[np.float64]
+    inlier_mask: NDArray[np.bool_]
+    n_inliers: int
+    upper_bound: int
+    gap: int
+    status: Status
+    residuals: NDArray[np.float64]
+    basis: NDArray[np.int64]
+    path: NDArray[np.int64]
+    threshold: float
+    method: str
+    seed: int | None
+    seconds: float
+
+    def __repr__(self) -> str:
+        return (
+            f"Consensus({self.n_inliers} of {len(self.inlier_mask)} points within {self.threshold:g}, "
+            f"{self.status}, gap {self.gap}, method {self.method!r}, {1e3 * self.seconds:.2f} ms)"
+        )

@@ -1,0 +1,89 @@
+"""From the best set that a search found to the `Consensus` that a user gets."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from maxcon.minimax import minimax_fit
+from maxcon.problem import Consensus, LinearProblem, Status, inlier_slack
+from maxcon.search.anytime import Best, Task
+
+
+def conclude(task: Task, best: Best, method: str, seed: int | None, seconds: float) -> Consensus:
+    """Return the result: the minimax fit of the inliers, everything else recomputed from its model.
+
+    The inliers of the fit of a set contain the set, and can be more; their own fit can have more again. The loop ends
+    with a model that is the fit of its own inliers.
+    """
+    problem = task.problem
+    limit = task.threshold + inlier_slack(task.threshold, problem.scale)
+    subset = best.subset if best.subset is not None and best.subset.any() else any_feasible_set(task)
+    if subset is None:
+        return _infeasible(problem, task.threshold, method, seed, seconds)
+    fit = minimax_fit(problem, subset)
+    mask = problem.residuals(fit.model) <= limit
+    while mask.sum() > subset.sum():
+        subset = mask
+        fit = minimax_fit(problem, subset)
+        mask = problem.residuals(fit.model) <= limit
+    n_inliers = int(mask.sum())
+    upper_bound = max(best.upper_bound, n_inliers)
+    status: Status = "heuristic"
+    if upper_bound == n_inliers:
+        status = "optimal"
+    elif upper_bound < problem.n_points:
+        status = "bounded"
+    return Consensus(
+        model=fit.model,
+        inlier_mask=mask,
+        n_inliers=n_inliers,
+        upper_bound=upper_bound,
+        gap=upper_bound - n_inliers,
+        status=status,
+        residuals=problem.residuals(fit.model),
+        basis=fit.basis,
+        path=best.path,
+        threshold=task.threshold,
+        method=method,
+        seed=seed,
+        seconds=seconds,
+    )
+
+
+def any_feasible_set(task: Task) -> NDArray[np.bool_] | None:
+    """Return some set of points that one model explains, however poor, or None if no model explains even one point.
+
+    This is what a search stopped before its first step has to show.
+    """
+    rows, limit = task.rows, task.limit
+    if np.abs(rows.b).min() <= limit:  # the least-squares fit of all points explains some
+        subset: NDArray[np.bool_] = np.abs(rows.b) <= limit
+        return subset
+    movable = np.flatnonzero(np.abs(rows.At).max(axis=0, initial=0.0) > 1e-9)
+    if len(movable) == 0:  # no parameter moves any residual, and none is within the threshold
+        return None
+    subset = np.zeros(task.problem.n_points, dtype=np.bool_)
+    subset[movable[0]] = True
+    return subset
+
+
+def _infeasible(
+    problem: LinearProblem, threshold: float, method: str, seed: int | None, seconds: float
+) -> Consensus:
+    N = problem.n_points
+    return Consensus(
+        model=np.full(problem.n_params, np.nan),
+        inlier_mask=np.zeros(N, dtype=np.bool_),
+        n_inliers=0,
+        upper_bound=0,
+        gap=0,
+        status="infeasible",
+        residuals=np.full(N, np.nan),
+        basis=np.empty(0, dtype=np.int64),
+        path=np.empty(0, dtype=np.int64),
+        threshold=threshold,
+        method=method,
+        seed=seed,
+        seconds=seconds,
+    )

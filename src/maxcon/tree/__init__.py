@@ -1,0 +1,1 @@
+"""The space that is searched: subsets as states, removals of basis points as actions (paper, sections 3.1 to 3.3)."""
