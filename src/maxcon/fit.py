@@ -45,12 +45,16 @@ METHODS: dict[str, MethodEntry] = {
         "the paper's method: a learned agent removes basis points until the rest fits",
     ),
     "greedy": MethodEntry(
-        "maxcon.search.removal:greedy", "removes the basis point whose removal lowers f(S) the most, until the rest fits"
+        "maxcon.search.removal:greedy",
+        "removes the basis point whose removal lowers f(S) the most, until the rest fits",
     ),
     "random": MethodEntry(
-        "maxcon.search.removal:random_removal", "removes random basis points until the rest fits (the paper's RB)"
+        "maxcon.search.removal:random_removal",
+        "removes random basis points until the rest fits (the paper's RB)",
     ),
-    "exact": MethodEntry("maxcon.search.sweep:exact_sweep", "the proven optimum, for d = 2: sweeps the arrangement of lines"),
+    "exact": MethodEntry(
+        "maxcon.search.sweep:exact_sweep", "the proven optimum, for d = 2: sweeps the arrangement of lines"
+    ),
 }
 
 REFINERS: dict[str, str] = {

@@ -133,7 +133,9 @@ class AgentConfig:
         train_names = {each.name for each in fields(TrainConfig)}
         unknown = set(changes) - network_names - train_names
         if unknown:
-            raise TypeError(f"unknown setting {sorted(unknown)[0]!r}; settings are {sorted(network_names | train_names)}")
+            raise TypeError(
+                f"unknown setting {sorted(unknown)[0]!r}; settings are {sorted(network_names | train_names)}"
+            )
         return AgentConfig(
             replace(self.network, **{k: v for k, v in changes.items() if k in network_names}),
             replace(self.train, **{k: v for k, v in changes.items() if k in train_names}),

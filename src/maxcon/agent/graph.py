@@ -66,9 +66,7 @@ def batched_neighbour_max(
 
 
 @kernel
-def scatter_gradient(
-    gradient: NDArray[np.float32], which: NDArray[np.int32], out: NDArray[np.float32]
-) -> None:
+def scatter_gradient(gradient: NDArray[np.float32], which: NDArray[np.int32], out: NDArray[np.float32]) -> None:
     """Add each gradient to the neighbour that was largest: the backward pass of `batched_neighbour_max`."""
     B, N, C = gradient.shape
     for s in range(B):

@@ -33,7 +33,7 @@ class Parameters(NamedTuple):
     Attributes
     ----------
     flat
-        For each EdgeConv the matrix [own | other], shape (n_in, 2 n_out), the bias, and the weight and bias of the norm;
+        For each EdgeConv the matrix [own | other], shape (n_in, 2 n_out), the bias, and weight and bias of the norm;
         then matrix and bias of the global feature; then of each layer of the head.
     widths
         Output width of each EdgeConv.
@@ -137,9 +137,7 @@ def make_scratch(parameters: Parameters, H: NDArray[np.float32], graph: NDArray[
     first = int(parameters.widths[0])
     n_in = m + parameters.n_channels
     weights = parameters.flat[: n_in * 2 * first].reshape(n_in, 2 * first)
-    bias = parameters.flat[n_in * 2 * first : n_in * 2 * first + first]
     cached = H @ weights[:m]
-    cached[:, :first] += bias
     widest = int(parameters.widths.max())
     total = int(parameters.widths.sum())
     longest = max(2 * total, total + parameters.global_width, int(parameters.head.max()))
@@ -174,11 +172,28 @@ def _add_product(X: NDArray[np.float32], W: NDArray[np.float32], Y: NDArray[np.f
             k += 1
 
 
+#: OpenBLAS wakes other threads for products of more multiplications than this, and that takes longer than the product.
+_ONE_THREAD = 262144
+
+
+@kernel
+def _product(X: NDArray[np.float32], W: NDArray[np.float32], Y: NDArray[np.float32]) -> None:
+    """Y = X @ W by BLAS, in blocks of rows."""
+    N, K = X.shape
+    block = max(1, _ONE_THREAD // (K * W.shape[1]))
+    low = 0
+    while low < N:
+        high = min(N, low + block)
+        np.dot(X[low:high], W, Y[low:high])
+        low = high
+
+
 @kernel
 def _neighbour_max_norm(
     both: NDArray[np.float32],
     width: int,
     graph: NDArray[np.int32],
+    own_bias: NDArray[np.float32],
     weight: NDArray[np.float32],
     bias: NDArray[np.float32],
     out: NDArray[np.float32],
@@ -209,7 +224,7 @@ def _neighbour_max_norm(
             m += 1
         own = both[i]
         for c in range(width):
-            row[c] += own[c]
+            row[c] += own[c] + own_bias[c]
         mean = _sum(row, width) * inverse
         for c in range(width):
             row[c] -= mean
@@ -302,15 +317,9 @@ def q_values(
                     row[c] = known[c]
             _add_product(channels, matrix[parameters.n_features :], both)
         else:
-            for i in range(N):
-                row = both[i]
-                for c in range(width):
-                    row[c] = bias[c]
-                for c in range(width, 2 * width):
-                    row[c] = np.float32(0.0)
-            _add_product(features, matrix, both)
+            _product(features, matrix, both)
         features = scratch.features[N * column : N * (column + width)].reshape((N, width))
-        _neighbour_max_norm(both, width, scratch.graph, weight, shift, features)
+        _neighbour_max_norm(both, width, scratch.graph, bias, weight, shift, features)
         column += width
         n_in = width
     _head(parameters, scratch, place, basis, q)
@@ -318,7 +327,12 @@ def q_values(
 
 @kernel
 def _affine(
-    flat: NDArray[np.float32], place: int, n_in: int, n_out: int, x: NDArray[np.float32], y: NDArray[np.float32]
+    flat: NDArray[np.float32],
+    place: int,
+    n_in: int,
+    n_out: int,
+    x: NDArray[np.float32],
+    y: NDArray[np.float32],
 ) -> int:
     """y = x @ matrix + bias, both read from `flat` at `place`; return the place after them."""
     bias = flat[place + n_in * n_out : place + n_in * n_out + n_out]
@@ -338,10 +352,15 @@ def _head(
     """Pool the features into the global one and run the MLP on the basis points."""
     flat = parameters.flat
     N = scratch.graph.shape[0]
-    pooled, inputs, here, there = scratch.vectors[0], scratch.vectors[1], scratch.vectors[2], scratch.vectors[3]
-    total = np.int64(0)
-    for width in parameters.widths:
-        total += width
+    pooled, inputs, here, there = (
+        scratch.vectors[0],
+        scratch.vectors[1],
+        scratch.vectors[2],
+        scratch.vectors[3],
+    )
+    total = 0
+    for layer in range(parameters.widths.shape[0]):
+        total += int(parameters.widths[layer])
     inverse = np.float32(1.0) / np.float32(N)
     column = 0
     for width in parameters.widths:
@@ -358,7 +377,7 @@ def _head(
         for c in range(width):
             mean[c] *= inverse
         column += width
-    n_global = parameters.global_width
+    n_global = int(parameters.global_width)
     place = _affine(flat, place, 2 * total, n_global, pooled, here)
     for c in range(n_global):
         inputs[total + c] = here[c] if here[c] > np.float32(0.0) else LEAK * here[c]
@@ -376,7 +395,7 @@ def _head(
         at = place
         source, target = inputs, here
         for layer in range(parameters.head.shape[0]):
-            n_out = parameters.head[layer]
+            n_out = int(parameters.head[layer])
             at = _affine(flat, at, n_in, n_out, source, target)
             if layer < parameters.head.shape[0] - 1:
                 for c in range(n_out):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -47,7 +48,7 @@ class EdgeConv(nn.Module):
 
     def forward(self, x: Tensor, graph: Tensor) -> Tensor:
         """Map x, shape (B, N, n_in), to (B, N, n_out)."""
-        largest: Tensor = _NeighbourMax.apply(self.other(x), graph)
+        largest: Tensor = _NeighbourMax.apply(self.other(x), graph)  # type: ignore[no-untyped-call]
         return functional.leaky_relu(self.norm(self.own(x) + largest), LEAK)
 
 
@@ -65,11 +66,11 @@ class QNetwork(nn.Module):
     def __init__(self, n_features: int, config: NetworkConfig) -> None:
         super().__init__()
         widths = (n_features + len(config.channels), *config.widths)
-        self.edge = nn.ModuleList(EdgeConv(a, b) for a, b in zip(widths, widths[1:], strict=False))
+        self.edge = nn.ModuleList(EdgeConv(a, b) for a, b in pairwise(widths))
         total = sum(config.widths)
         self.pool = nn.Linear(2 * total, config.global_width)
         sizes = (total + config.global_width, *config.head, 1)
-        self.head = nn.ModuleList(nn.Linear(a, b) for a, b in zip(sizes, sizes[1:], strict=False))
+        self.head = nn.ModuleList(nn.Linear(a, b) for a, b in pairwise(sizes))
 
     def forward(self, H: Tensor, graph: Tensor, channels: Tensor, basis: Tensor) -> Tensor:
         """Return the Q-value of every slot, shape (B, n), minus infinity where a slot is empty.
@@ -95,9 +96,8 @@ class QNetwork(nn.Module):
         everything = functional.leaky_relu(self.pool(pooled), LEAK)
         # The basis mask comes first: an MLP on each point by itself need not see the points that it masks.
         slots = basis.clamp(min=0).unsqueeze(2).expand(-1, -1, features.shape[2])
-        value = torch.cat(
-            [features.gather(1, slots), everything.unsqueeze(1).expand(-1, basis.shape[1], -1)], dim=2
-        )
+        value = torch.cat([features.gather(1, slots), everything.unsqueeze(1).expand(-1, basis.shape[1], -1)], dim=2)
         for layer in self.head[:-1]:
             value = functional.leaky_relu(layer(value), LEAK)
-        return self.head[-1](value).squeeze(2).masked_fill(basis < 0, -torch.inf)
+        q: Tensor = self.head[-1](value).squeeze(2)
+        return q.masked_fill(basis < 0, -torch.inf)

@@ -85,14 +85,18 @@ class ReplayMemory:
             steps[reached] = ahead + 1
             finished |= reached
         return Transitions(
-            self._states(t, k), self.action[t, k].astype(np.int64), steps, finished, self._states((t + n_step) % T, k)
+            self._states(t, k),
+            self.action[t, k].astype(np.int64),
+            steps,
+            finished,
+            self._states((t + n_step) % T, k),
         )
 
     def _states(self, t: NDArray[np.int64], k: NDArray[np.int64]) -> StateBatch:
         return StateBatch(
             self.instance[t, k].astype(np.int64),
             self.x[t, k],
-            1.0 - self.removed[t, k],
+            np.where(self.removed[t, k], 0.0, 1.0),
             self.basis[t, k].astype(np.int64),
             self.multipliers[t, k].astype(np.float64),
         )
@@ -134,7 +138,9 @@ def encode_states(
         encode_channels(r, gamma, limit[m], gain[s], basis[s], multipliers[s], flags, out[s])
 
 
-def encode(instances: Instances, states: StateBatch | BatchEnvironment, flags: NDArray[np.bool_]) -> NDArray[np.float32]:
+def encode(
+    instances: Instances, states: StateBatch | BatchEnvironment, flags: NDArray[np.bool_]
+) -> NDArray[np.float32]:
     """Return the channels of `states`, shape (B, N, number of true flags)."""
     out = np.empty((len(states.instance), instances.n_points, int(flags.sum())), dtype=np.float32)
     encode_states(

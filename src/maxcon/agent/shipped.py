@@ -18,8 +18,8 @@ def agent_names() -> tuple[str, ...]:
     return tuple(sorted(path.stem for path in _FOLDER.glob("*.safetensors")))
 
 
-def model_card(name: str) -> str:
-    """Return the model card of a shipped agent, Markdown.
+def agent_path(name: str) -> Path:
+    """Return the file of a shipped agent.
 
     Raises
     ------
@@ -28,7 +28,12 @@ def model_card(name: str) -> str:
     """
     if name not in agent_names():
         raise ValueError(f"name must be one of {', '.join(agent_names())}, but it is {name!r}")
-    return (_FOLDER / f"{name}.md").read_text(encoding="utf-8")
+    return _FOLDER / f"{name}.safetensors"
+
+
+def model_card(name: str) -> str:
+    """Return the model card of a shipped agent, Markdown; ValueError if there is no agent of this name."""
+    return agent_path(name).with_suffix(".md").read_text(encoding="utf-8")
 
 
 def shipped_agent(problem: LinearProblem) -> Agent:
@@ -49,4 +54,4 @@ def shipped_agent(problem: LinearProblem) -> Agent:
 
 @cache
 def _load(name: str) -> Agent:
-    return Agent.load(_FOLDER / f"{name}.safetensors")
+    return Agent.load(agent_path(name))

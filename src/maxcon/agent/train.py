@@ -1,7 +1,7 @@
 """Training as a run in a folder: logs, a progress bar with the held-out gap, checkpoints that resume exactly.
 
-A run folder holds ``config.json``, ``log.jsonl`` (a line a report), TensorBoard's event files, ``checkpoint.pt`` (everything
-that changes, replaced atomically) and, when the run has ended, ``agent.safetensors``.
+A run folder holds ``config.json``, ``log.jsonl`` (a line a report), TensorBoard's event files, ``checkpoint.pt``
+(everything that changes, replaced atomically) and, when the run has ended, ``agent.safetensors``.
 """
 
 from __future__ import annotations
@@ -169,7 +169,7 @@ class _Log:
             lines = [line for line in self.path.read_text(encoding="utf-8").splitlines() if line.endswith("}")]
             kept = [line for line in lines if json.loads(line)["updates"] <= updates]
             self.path.write_text("".join(line + "\n" for line in kept), encoding="utf-8")
-        self.board = SummaryWriter(str(folder), purge_step=updates + 1)  # type: ignore[no-untyped-call]
+        self.board = SummaryWriter(str(folder), purge_step=updates + 1)
         self.began = time.perf_counter()
 
     def write(self, learner: Learner, loss: float, gaps: dict[float, float]) -> None:
@@ -181,12 +181,12 @@ class _Log:
         }
         with self.path.open("a", encoding="utf-8") as file:
             file.write(json.dumps(entry) + "\n")
-        self.board.add_scalar("loss", loss, learner.updates)  # type: ignore[no-untyped-call]
+        self.board.add_scalar("loss", loss, learner.updates)
         for rate, gap in gaps.items():
-            self.board.add_scalar(f"held-out gap/{rate:.2f}", gap, learner.updates)  # type: ignore[no-untyped-call]
+            self.board.add_scalar(f"held-out gap/{rate:.2f}", gap, learner.updates)
 
     def close(self) -> None:
-        self.board.close()  # type: ignore[no-untyped-call]
+        self.board.close()
 
 
 @contextmanager

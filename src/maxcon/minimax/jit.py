@@ -64,7 +64,10 @@ class _FirstCompilation(event.Listener):  # type: ignore[misc]
         module = getattr(getattr(dispatcher, "py_func", None), "__module__", "")
         if not self.said and module.startswith("maxcon."):
             self.said = True
-            print("maxcon: compiling its kernels for this machine (once; they are kept on disk) ...", file=sys.stderr)
+            print(
+                "maxcon: compiling its kernels for this machine (once; they are kept on disk) ...",
+                file=sys.stderr,
+            )
 
     def on_end(self, event: Any) -> None:
         return

@@ -36,8 +36,7 @@ def compute_residuals(
     At: NDArray[np.float64], b: NDArray[np.float64], x: NDArray[np.float64], r: NDArray[np.float64]
 ) -> None:
     """Write r = b - At.T @ x[:d]."""
-    d, N = At.shape
-    for i in range(N):
+    for i in range(b.shape[0]):
         r[i] = b[i]
     _subtract_product(At, x, r)
 
@@ -91,7 +90,11 @@ def _most_violated(
 
 @kernel
 def _first_violated(
-    r: NDArray[np.float64], gain: NDArray[np.float64], cap: NDArray[np.float64], gamma: float, tolerance: float
+    r: NDArray[np.float64],
+    gain: NDArray[np.float64],
+    cap: NDArray[np.float64],
+    gamma: float,
+    tolerance: float,
 ) -> int:
     for i in range(r.shape[0]):
         if abs(r[i]) - (gain[i] * gamma + cap[i]) > tolerance:
@@ -100,9 +103,7 @@ def _first_violated(
 
 
 @kernel
-def _fill_row(
-    At: NDArray[np.float64], gain: NDArray[np.float64], name: int, n: int, g: NDArray[np.float64]
-) -> None:
+def _fill_row(At: NDArray[np.float64], gain: NDArray[np.float64], name: int, n: int, g: NDArray[np.float64]) -> None:
     """Write the row called `name` into g."""
     if name < 0:
         for j in range(n):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -101,7 +102,7 @@ class BatchEnvironment:
         self._work = np.zeros((3, max(N, n)))
         self._table = np.zeros((n + 2, n))
 
-    def _arrays(self) -> tuple[NDArray[np.generic], ...]:
+    def _arrays(self) -> Any:
         """Return what every kernel takes."""
         return (
             self.instances.At, self.instances.b, self.instances.limit, self.instance,
@@ -112,7 +113,7 @@ class BatchEnvironment:
     def reset(self, episodes: NDArray[np.int64], instances: NDArray[np.int64]) -> None:
         """Start the named episodes on the named instances (one each); a feasible instance is at its goal at once."""
         self.instance[episodes] = instances
-        if _reset(*self._arrays(), np.asarray(episodes, dtype=np.int64)) != OK:
+        if _reset(np.asarray(episodes, dtype=np.int64), *self._arrays()) != OK:
             raise ArithmeticError("a minimax fit did not converge at the start of an episode")
 
     def step(self, actions: NDArray[np.int64]) -> NDArray[np.float64]:
@@ -131,7 +132,7 @@ class BatchEnvironment:
         if np.any(live & ((slots < 0) | (slots >= self.basis.shape[1]) | (chosen < 0))):
             raise ValueError("actions must name slots that hold a basis point, but one does not")
         rewards = np.where(live, -1.0, 0.0)
-        if _step(*self._arrays(), slots) != OK:
+        if _step(slots, *self._arrays()) != OK:
             raise ArithmeticError("a minimax fit did not converge after a removal")
         return rewards
 
@@ -157,11 +158,28 @@ def _look(
 ) -> bool:
     basis_points(C, q, basis)
     basis_multipliers(C, q, basis, multipliers)
-    return x[x.shape[0] - 1] <= limit
+    return bool(x[x.shape[0] - 1] <= limit)
 
 
 @kernel
-def _reset(At, b, limit, instance, gain, cap, C, x, q, r, work, table, basis, multipliers, done, episodes):  # type: ignore[no-untyped-def]
+def _reset(
+    episodes: NDArray[np.int64],
+    At: NDArray[np.float64],
+    b: NDArray[np.float64],
+    limit: NDArray[np.float64],
+    instance: NDArray[np.int64],
+    gain: NDArray[np.float64],
+    cap: NDArray[np.float64],
+    C: NDArray[np.float64],
+    x: NDArray[np.float64],
+    q: NDArray[np.int64],
+    r: NDArray[np.float64],
+    work: NDArray[np.float64],
+    table: NDArray[np.float64],
+    basis: NDArray[np.int64],
+    multipliers: NDArray[np.float64],
+    done: NDArray[np.bool_],
+) -> int:
     for k in episodes:
         m = instance[k]
         gain[k, :] = 1.0
@@ -174,7 +192,24 @@ def _reset(At, b, limit, instance, gain, cap, C, x, q, r, work, table, basis, mu
 
 
 @kernel
-def _step(At, b, limit, instance, gain, cap, C, x, q, r, work, table, basis, multipliers, done, slots):  # type: ignore[no-untyped-def]
+def _step(
+    slots: NDArray[np.int64],
+    At: NDArray[np.float64],
+    b: NDArray[np.float64],
+    limit: NDArray[np.float64],
+    instance: NDArray[np.int64],
+    gain: NDArray[np.float64],
+    cap: NDArray[np.float64],
+    C: NDArray[np.float64],
+    x: NDArray[np.float64],
+    q: NDArray[np.int64],
+    r: NDArray[np.float64],
+    work: NDArray[np.float64],
+    table: NDArray[np.float64],
+    basis: NDArray[np.int64],
+    multipliers: NDArray[np.float64],
+    done: NDArray[np.bool_],
+) -> int:
     for k in range(slots.shape[0]):
         if done[k]:
             continue

@@ -1,0 +1,184 @@
+"""The compiled network equals the torch network."""
+
+import numpy as np
+import pytest
+import torch
+
+import maxcon
+from maxcon.agent.config import paper, shipped
+from maxcon.agent.graph import batched_neighbour_max, neighbour_graph, neighbour_max, scatter_gradient
+from maxcon.agent.inference import Agent, pack, q_values
+from maxcon.agent.network import QNetwork
+from maxcon.agent.shipped import agent_names, agent_path, model_card, shipped_agent
+from maxcon.agent.weights import load_weights, save_weights
+from maxcon.datasets.synthetic import synthetic_hyperplane
+from maxcon.tree import root
+from maxcon.tree.encoding import canonical_features, raw_features
+
+
+def random_network(config, n_features, seed):
+    torch.manual_seed(seed)
+    network = QNetwork(n_features, config.network)
+    for parameter in network.parameters():  # norms and biases too: their initial ones and zeros hide mistakes
+        torch.nn.init.normal_(parameter, std=0.3)
+    return network
+
+
+def states(problem, rng, channels):
+    """All states of a random walk down the tree, as (channels, basis)."""
+    state = root(problem, 0.1)
+    columns = len(channels)
+    while not state.is_goal:
+        yield np.ascontiguousarray(state.encode(channels)[:, -columns:]), state.basis
+        state = state.remove(rng.choice(np.flatnonzero(state.action_mask)))
+
+
+@pytest.mark.parametrize(
+    ("n_params", "n_points", "changes"),
+    [
+        (2, 100, {}),
+        (3, 60, {}),
+        (2, 7, {}),  # fewer points than neighbours
+        (4, 150, {"widths": (16, 24), "head": (8,), "global_width": 12}),
+        (2, 50, {"widths": (5, 7, 9), "head": (6, 5, 4), "global_width": 3, "neighbours": 4}),
+    ],
+)
+def test_compiled_equals_torch(n_params, n_points, changes):
+    rng = np.random.default_rng(n_points)
+    for base in (shipped, paper):
+        config = base(n_params).override(**changes)
+        network = random_network(config, n_params, n_points)
+        tensors = {name: value.detach().numpy() for name, value in network.state_dict().items()}
+        agent = Agent(config, pack(tensors, config))
+        problem = synthetic_hyperplane(rng, n_points, 0.4, n_params)
+        H = canonical_features(problem) if config.network.canonical else raw_features(problem)
+        graph = neighbour_graph(H, config.network.neighbours)
+        scratch = agent.prepare(problem)
+        found = np.empty(n_params + 1)
+        n_states = 0
+        for channels, basis in states(problem, rng, config.network.channels):
+            q_values(agent.parameters, scratch, channels, basis, found)
+            with torch.no_grad():
+                inputs = (H, graph, channels, basis)
+                expected = network(*(torch.from_numpy(each)[None] for each in inputs))[0].numpy()
+            assert np.array_equal(np.isinf(found), basis < 0)
+            filled = basis >= 0
+            assert np.abs(found[filled] - expected[filled]).max() <= 1e-5 * max(1, np.abs(expected[filled]).max())
+            n_states += 1
+        assert n_states > 0
+
+
+def test_shipped_agents_equal_torch_to_1e_5():
+    for name, n_params in (("line", 2), ("plane", 3)):
+        assert name in agent_names()
+        problem = synthetic_hyperplane(np.random.default_rng(1), 100, 0.5, n_params)
+        agent = shipped_agent(problem)
+        network = QNetwork(n_params, agent.config.network)
+        tensors, _ = load_weights(agent_path(name))
+        network.load_state_dict({key: torch.from_numpy(value) for key, value in tensors.items()})
+        H = canonical_features(problem)
+        graph = neighbour_graph(H, agent.config.network.neighbours)
+        scratch = agent.prepare(problem)
+        found = np.empty(n_params + 1)
+        for channels, basis in states(problem, np.random.default_rng(2), agent.config.network.channels):
+            q_values(agent.parameters, scratch, channels, basis, found)
+            with torch.no_grad():
+                expected = network(*(torch.from_numpy(each)[None] for each in (H, graph, channels, basis)))[0].numpy()
+            assert np.abs(found - expected).max() <= 1e-5
+
+
+def test_model_cards_name_their_command_and_seed():
+    for name in agent_names():
+        card = model_card(name)
+        for word in ("seed", f"maxcon train {name}", "held-out"):
+            assert word in card, (name, word)
+    with pytest.raises(ValueError, match="name must be one of"):
+        model_card("circle")
+
+
+def test_q_does_not_depend_on_the_order_of_the_points():
+    config = shipped(2)
+    network = random_network(config, 2, 0)
+    agent = Agent(config, pack({k: v.detach().numpy() for k, v in network.state_dict().items()}, config))
+    rng = np.random.default_rng(0)
+    problem = synthetic_hyperplane(rng, 80, 0.3, 2)
+    channels, basis = next(states(problem, rng, config.network.channels))
+    order = rng.permutation(80)
+    shuffled = maxcon.LinearProblem(problem.A[order], problem.b[order])
+    first, second = np.empty(3), np.empty(3)
+    q_values(agent.parameters, agent.prepare(problem), np.ascontiguousarray(channels), basis, first)
+    where = np.argsort(order)[basis]
+    q_values(agent.parameters, agent.prepare(shuffled), np.ascontiguousarray(channels[order]), where, second)
+    assert np.abs(first - second).max() < 1e-4
+
+
+def test_canonical_agents_do_not_see_units():
+    config = shipped(2)
+    network = random_network(config, 2, 0)
+    agent = Agent(config, pack({k: v.detach().numpy() for k, v in network.state_dict().items()}, config))
+    rng = np.random.default_rng(0)
+    x, y = rng.normal(size=60), rng.normal(size=60)
+    first, second = root(maxcon.line(x, y), 0.1), root(maxcon.line(1950 + 7 * x, 1e3 * y + 55 * x + 8), 100.0)
+    assert np.array_equal(first.basis, second.basis)
+    found = []
+    for state in (first, second):
+        q = np.empty(3)
+        channels = np.ascontiguousarray(state.encode(config.network.channels)[:, -5:])
+        q_values(agent.parameters, agent.prepare(state.problem), channels, state.basis, q)
+        found.append(q)
+    assert np.allclose(*found, atol=1e-4)
+
+
+def test_an_agent_for_another_number_of_columns_is_refused():
+    config = shipped(2)
+    network = random_network(config, 2, 0)
+    agent = Agent(config, pack({k: v.detach().numpy() for k, v in network.state_dict().items()}, config))
+    with pytest.raises(ValueError, match="problem must have 1 columns that vary"):
+        agent.prepare(synthetic_hyperplane(np.random.default_rng(0), 30, 0.3, 3))
+
+
+def test_weights_survive_the_file(tmp_path):
+    config = shipped(3, seed=4).override(widths=(8, 8))
+    network = random_network(config, 3, 0)
+    save_weights(network, config, tmp_path / "a.safetensors")
+    tensors, read = load_weights(tmp_path / "a.safetensors")
+    assert read == config
+    for name, value in network.state_dict().items():
+        assert np.array_equal(tensors[name], value.numpy())
+
+
+def test_broken_weight_files_are_refused(tmp_path):
+    with pytest.raises(ValueError, match="weights must name an agent file"):
+        load_weights(tmp_path / "none.safetensors")
+    (tmp_path / "bad.safetensors").write_bytes(b"hello, this is not it")
+    with pytest.raises(ValueError, match="weights must be a safetensors file"):
+        load_weights(tmp_path / "bad.safetensors")
+
+
+def test_neighbour_max_and_its_gradient_against_the_obvious():
+    rng = np.random.default_rng(0)
+    q = rng.normal(size=(3, 20, 6)).astype(np.float32)
+    graph = rng.integers(0, 20, (3, 20, 5)).astype(np.int32)
+    out, which = np.empty_like(q), np.empty(q.shape, dtype=np.int32)
+    batched_neighbour_max(q, graph, out, which)
+    gathered = np.stack([q[s][graph[s]] for s in range(3)])
+    assert np.array_equal(out, gathered.max(axis=2))
+    single = np.empty_like(q[0])
+    neighbour_max(q[0], graph[0], single)
+    assert np.array_equal(single, out[0])
+    gradient = rng.normal(size=q.shape).astype(np.float32)
+    expected = np.zeros_like(q)
+    for s, i, c in np.ndindex(*q.shape):
+        expected[s, graph[s, i, gathered[s, i, :, c].argmax()], c] += gradient[s, i, c]
+    found = np.zeros_like(q)
+    scatter_gradient(gradient, which, found)
+    assert np.allclose(found, expected, atol=1e-6)
+
+
+def test_graph_against_the_obvious():
+    H = np.random.default_rng(0).normal(size=(40, 3)).astype(np.float32)
+    distance = ((H[:, None] - H[None]) ** 2).sum(axis=2)
+    assert np.array_equal(np.sort(neighbour_graph(H, 6)), np.sort(np.argsort(distance, axis=1)[:, :6]))
+    small = neighbour_graph(H[:3], 6)
+    assert small.shape == (3, 6)
+    assert np.array_equal(small[:, 3:], np.arange(3)[:, None].repeat(3, axis=1))
