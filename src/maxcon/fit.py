@@ -52,9 +52,23 @@ METHODS: dict[str, MethodEntry] = {
         "maxcon.search.removal:random_removal",
         "removes random basis points until the rest fits (the paper's RB)",
     ),
-    "exact": MethodEntry(
-        "maxcon.search.sweep:exact_sweep", "the proven optimum, for d = 2: sweeps the arrangement of lines"
+    "ransac": MethodEntry(
+        "maxcon.search.sampling:ransac", "models through minimal random samples (Fischler & Bolles 1981)"
     ),
+    "lo-ransac": MethodEntry(
+        "maxcon.search.sampling:lo_ransac", "RANSAC with local optimisation of every new best (Chum et al. 2003)"
+    ),
+    "gnc": MethodEntry(
+        "maxcon.search.gnc:gnc", "graduated non-convexity with the Geman-McClure kernel (Yang et al. 2020)"
+    ),
+    "peel": MethodEntry(
+        "maxcon.search.peel:peel",
+        "from a good model, removes the basis point that it explains worst, until the rest fits",
+    ),
+    "sweep": MethodEntry(
+        "maxcon.search.sweep:exact_sweep", "the proven optimum, d = 2: sweeps the arrangement of lines"
+    ),
+    "exact": MethodEntry("maxcon.search.sweep:exact_sweep", "the proven optimum, for d = 2"),
 }
 
 REFINERS: dict[str, str] = {

@@ -1,0 +1,391 @@
+"""Kernels of local tree refinement (paper, Algorithm 2) and of its swap extension.
+
+They work in place on the arrays of a `Workspace`, which tell what is in the set: a point with gain 1 and cap
+0 is in, one with an infinite cap is out and may be added. Any other mode (an enforced point) is kept as it
+is. Other compiled searches call `refine_kernel` or `swap_kernel` at any vertex of theirs whose gamma is
+within the limit.
+
+Why one pass is enough, where the paper loops until nothing changes: f is monotone, f(S) <= f(T) for S within
+T. Let j be rejected at S, f(S + j) > threshold. Every later set T holds S, so f(T + j) >= f(S + j) >
+threshold: j would be rejected again, in whatever order and however often it is tried. The end is the same as
+the paper's for the same order of the points: a set to which no single point can be added.
+
+What makes it cheap, on top of warm starts:
+
+- The vertex is a witness: with gamma <= limit, all points whose residual at it is within the limit fit one
+  model, so they are added together, without asking the simplex.
+- The first dual pivot of adding j has a value that can be had without making it, and by duality that value is
+  a lower bound on f(S + j). Most points are rejected by it. By the same proof the bound stays true for every
+  later set.
+
+The order in which the rest is tried: smallest bound first, then ascending index; so the result depends on
+nothing but the set and the data.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from maxcon.minimax import LinearRows, Workspace
+from maxcon.minimax.jit import kernel
+from maxcon.minimax.linear import (
+    BASIS_TOLERANCE,
+    FEASIBILITY_TOLERANCE,
+    OK,
+    basis_points,
+)
+from maxcon.minimax.simplex import FREE_TOLERANCE
+from maxcon.search.vertex_kernels import (
+    VertexCopies,
+    add_point,
+    allocate_copies,
+    load_vertex,
+    remove_point,
+    save_vertex,
+)
+
+#: A row leaves the basis in the bound only if its coefficient is above this: below, it is rounding of a zero,
+#: and ignoring it changes the bound by no more than that.
+COEFFICIENT_FLOOR = 1e-13
+
+
+class RefineScratch(NamedTuple):
+    """Scratch space of the refinement kernels, for one problem.
+
+    Attributes
+    ----------
+    copies
+        Two levels: 0 for the point being tried, 1 for the set of which a point is being swapped.
+    tried
+        Shape (N,), bool: points that are not to be tried (again).
+    fresh
+        Shape (N,), bool: points added on the word of a witness, until the fit confirms it.
+    bound, leave
+        Shape (N,) each: a lower bound on f(S + i), and the basis row without which the rest proves it.
+    certificate
+        Shape (N, d + 1): points of the set that are infeasible together with i, then -1; for i that are out.
+    before
+        Shape (N, d + 1): copies of certificates.
+    basis
+        Shape (d + 1,): the points of a basis.
+    kept, dropped, blame
+        Shape (N,) each: the set of which a point is being swapped, the points that were dropped from it in
+        vain, and in how many certificates each point is.
+    """
+
+    copies: VertexCopies
+    tried: NDArray[np.bool_]
+    fresh: NDArray[np.bool_]
+    bound: NDArray[np.float64]
+    leave: NDArray[np.int64]
+    certificate: NDArray[np.int64]
+    before: NDArray[np.int64]
+    basis: NDArray[np.int64]
+    kept: NDArray[np.bool_]
+    dropped: NDArray[np.bool_]
+    blame: NDArray[np.int64]
+
+
+def allocate_refinement(rows: LinearRows) -> RefineScratch:
+    """Return scratch space for `refine_kernel` and `swap_kernel` on `rows`."""
+    d, N = rows.At.shape
+    return RefineScratch(
+        allocate_copies(rows, 2),
+        np.zeros(N, dtype=np.bool_),
+        np.zeros(N, dtype=np.bool_),
+        np.zeros(N),
+        np.zeros(N, dtype=np.int64),
+        np.full((N, d + 1), -1, dtype=np.int64),
+        np.full((N, d + 1), -1, dtype=np.int64),
+        np.zeros(d + 1, dtype=np.int64),
+        np.zeros(N, dtype=np.bool_),
+        np.zeros(N, dtype=np.bool_),
+        np.zeros(N, dtype=np.int64),
+    )
+
+
+@kernel
+def addition_bounds(ws: Workspace, bound: NDArray[np.float64], leave: NDArray[np.int64]) -> None:
+    """Write a lower bound on f(S + i) for all points i: the value of the first dual pivot, which is not made.
+
+    The row of point i is g = sum_k w[k] * row k. Entering it with multiplier t changes the multipliers of the
+    basis rows to (theirs - t w), a dual solution for as long as these stay >= 0, and its value is gamma + t *
+    excess: by duality a lower bound. The basis row that limits t goes to `leave`, -1 for none: the points of
+    the other rows, and i, prove the bound on their own.
+
+    All points are done together, one basis row at a time, because that vectorises; most of the cost of one
+    point is that of all.
+    """
+    At, C, q, r = ws.At, ws.C, ws.q, ws.r
+    n = q.shape[0]
+    N = r.shape[0]
+    w = ws.work[0, :N]
+    gamma = ws.x[n - 1]
+    for i in range(N):
+        bound[i] = np.inf  # holds t at first
+        leave[i] = -1
+    for k in range(n):
+        multiplier = max(C[n - 1, k], 0.0)
+        for i in range(N):
+            w[i] = 0.0
+        for j in range(n - 1):
+            a = At[j]
+            c = C[j, k]
+            for i in range(N):
+                w[i] += c * a[i]
+        if q[k] < 0 and q[k] > -n:  # a variable that nothing holds yet takes up the excess
+            for i in range(N):
+                if abs(w[i]) > FREE_TOLERANCE:
+                    bound[i] = 0.0
+                    leave[i] = -1
+            continue
+        for i in range(N):
+            coefficient = C[n - 1, k] + (w[i] if r[i] >= 0.0 else -w[i])
+            t = multiplier / coefficient if coefficient > COEFFICIENT_FLOOR else np.inf
+            if t < bound[i]:
+                bound[i] = t
+                leave[i] = k
+    for i in range(N):
+        t = bound[i] if bound[i] < np.inf else 0.0
+        bound[i] = gamma + t * max(abs(r[i]) - gamma, 0.0)
+
+
+@kernel
+def _rounding(x: NDArray[np.float64]) -> float:
+    """Return by how much the simplex takes a row to be kept; see `FEASIBILITY_TOLERANCE`."""
+    size = 1.0
+    for j in range(x.shape[0]):
+        size += abs(x[j])
+    return FEASIBILITY_TOLERANCE * size
+
+
+@kernel
+def _add_witnessed(ws: Workspace, limit: float, scratch: RefineScratch) -> int:
+    """Add all points that the vertex itself keeps within the limit, and re-fit; return how many they were."""
+    gamma = ws.x[ws.x.shape[0] - 1]
+    safe = limit - 2.0 * _rounding(ws.x)  # at the very edge the simplex is asked, point by point
+    count = 0
+    farthest = -1
+    for i in range(ws.r.shape[0]):
+        scratch.fresh[i] = ws.cap[i] == np.inf and not scratch.tried[i] and abs(ws.r[i]) <= safe
+        if scratch.fresh[i]:
+            count += 1
+            if farthest < 0 or abs(ws.r[i]) > abs(ws.r[farthest]):
+                farthest = i
+            ws.gain[i] = 1.0
+            ws.cap[i] = 0.0
+    if count == 0 or abs(ws.r[farthest]) <= gamma:
+        return count
+    save_vertex(ws, scratch.copies, 0)
+    if add_point(ws, farthest, np.inf) == OK and ws.x[ws.x.shape[0] - 1] <= limit:
+        return count
+    # Only a vertex on which rounding has gone astray gets here: believe none of it.
+    load_vertex(ws, scratch.copies, 0)
+    for i in range(ws.r.shape[0]):
+        if scratch.fresh[i]:
+            ws.gain[i] = 0.0
+            ws.cap[i] = np.inf
+    return 0
+
+
+@kernel
+def _write_certificate(ws: Workspace, leave: int, point: int, certificate: NDArray[np.int64]) -> None:
+    """Write the points of the basis rows that prove `point` infeasible, then -1.
+
+    If basis row `leave` >= 0 made room for it in the pivot that was not made, these are all others, since
+    even a multiplier of 0 may have grown in it; with -1, at the vertex that proves it, those with a positive
+    multiplier.
+    """
+    n = ws.x.shape[0]
+    size = 0
+    for k in range(n):
+        if ws.q[k] < 0 or k == leave or ws.q[k] >> 1 == point:
+            continue
+        if leave >= 0 or ws.C[n - 1, k] > BASIS_TOLERANCE:
+            certificate[size] = ws.q[k] >> 1
+            size += 1
+    for k in range(size, n):
+        certificate[k] = -1
+
+
+@kernel
+def _most_promising(ws: Workspace, limit: float, scratch: RefineScratch, moved: bool, least: int) -> int:
+    """Return the point with the smallest bound on f(S + i); -1 if fewer than `least` points may still fit.
+
+    The bounds are computed anew if the vertex has `moved`.
+    """
+    cap, tried, bound = ws.cap, scratch.tried, scratch.bound
+    best = -1
+    count = 0
+    margin = limit + _rounding(ws.x)
+    if moved:
+        addition_bounds(ws, bound, scratch.leave)
+    for i in range(ws.r.shape[0]):
+        if tried[i] or cap[i] != np.inf:
+            continue
+        if bound[i] > margin:
+            tried[i] = True
+            _write_certificate(ws, scratch.leave[i], i, scratch.certificate[i])
+            continue
+        count += 1
+        if best < 0 or bound[i] < bound[best]:
+            best = i
+    return best if count >= least else -1
+
+
+@kernel
+def refine_kernel(ws: Workspace, limit: float, scratch: RefineScratch) -> int:
+    """Add points until none can be added (paper, Algorithm 2); return how many were.
+
+    Parameters
+    ----------
+    ws
+        At the vertex of its set, gamma <= limit. On return at the vertex of the larger set, gamma <= limit.
+    limit
+        Threshold plus slack, in the unit of the rows.
+    scratch
+        From `allocate_refinement`. Points with `scratch.tried` set are left out; false everywhere tries all
+        that have an infinite cap. On return it is set for every point that is out, and for those that were
+        tried `scratch.certificate` says why.
+
+    Notes
+    -----
+    A point whose fit fails for rounding is left out, which is always sound.
+    """
+    return _refine(ws, limit, scratch, 1)
+
+
+@kernel
+def _refine(ws: Workspace, limit: float, scratch: RefineScratch, least: int) -> int:
+    """Do what `refine_kernel` does, but give up as soon as fewer than `least` points can be added in all."""
+    n = ws.x.shape[0]
+    added = _add_witnessed(ws, limit, scratch)
+    moved = True
+    while True:
+        point = _most_promising(ws, limit, scratch, moved, max(least - added, 1))
+        if point < 0:
+            return added
+        scratch.tried[point] = True
+        save_vertex(ws, scratch.copies, 0)
+        moved = add_point(ws, point, limit) == OK and ws.x[n - 1] <= limit
+        if moved:
+            added += 1 + _add_witnessed(ws, limit, scratch)
+        else:
+            _write_certificate(ws, -1, point, scratch.certificate[point])
+            ws.gain[point] = 0.0
+            ws.cap[point] = np.inf
+            load_vertex(ws, scratch.copies, 0)
+
+
+@kernel
+def swap_kernel(ws: Workspace, limit: float, scratch: RefineScratch) -> int:
+    """Refine; then drop a basis point where at least two others fit in its place, until none is worth it.
+
+    Parameters, and what is left on return, are those of `refine_kernel`, but `scratch.tried` is cleared here.
+    Returns how many points the set has more; each swap gains at least one, so there are at most N.
+
+    Notes
+    -----
+    Every point j that is out has a certificate: points of S that are infeasible together with j. Dropping a
+    point p of S helps only those j whose certificates hold p, so only a p in at least two certificates is
+    worth trying, and only these j are tried in its place. (Dropping points of certificates that are not in
+    the basis B(S) was tried: it found nothing more on the paper's synthetic data and took half as long
+    again.)
+
+    The dropped p is not tried again for its own swap, nor need it be: S takes no further point, so any set
+    with p, the rest of S and a new point j holds an infeasible S + j. The final set is therefore still
+    maximal.
+    """
+    N = ws.r.shape[0]
+    for i in range(N):
+        scratch.tried[i] = False
+        scratch.dropped[i] = False
+    gained = refine_kernel(ws, limit, scratch)
+    changed = True
+    while True:
+        if changed:
+            save_vertex(ws, scratch.copies, 1)
+            for i in range(N):
+                scratch.kept[i] = ws.gain[i] == 1.0
+        point = _most_blamed(ws, scratch)
+        if point < 0:
+            return gained
+        scratch.dropped[point] = True
+        _choose_substitutes(ws, scratch, point)
+        more = 0
+        if remove_point(ws, point) == OK and ws.x[ws.x.shape[0] - 1] <= limit:
+            more = _refine(ws, limit, scratch, 2) - 1
+        changed = more > 0
+        if changed:
+            gained += more
+            _accept_swap(ws, scratch, point)
+        else:
+            _undo_swap(ws, scratch)
+
+
+@kernel
+def _most_blamed(ws: Workspace, scratch: RefineScratch) -> int:
+    """Return the basis point in most certificates, at least two, that was not dropped before; or -1."""
+    N = ws.r.shape[0]
+    for i in range(N):
+        scratch.blame[i] = 0
+    for i in range(N):
+        if ws.cap[i] == np.inf:
+            for point in scratch.certificate[i]:
+                if point >= 0:
+                    scratch.blame[point] += 1
+    size = basis_points(ws.C, ws.q, scratch.basis)
+    best = -1
+    most = 1
+    for k in range(size):
+        point = scratch.basis[k]
+        if scratch.blame[point] > most and scratch.kept[point] and not scratch.dropped[point]:
+            best = point
+            most = scratch.blame[point]
+    return best
+
+
+@kernel
+def _choose_substitutes(ws: Workspace, scratch: RefineScratch, point: int) -> None:
+    """Let only the points with `point` in their certificate be tried; keep copies of these certificates."""
+    n = ws.x.shape[0]
+    for i in range(ws.r.shape[0]):
+        scratch.tried[i] = True
+        if ws.cap[i] == np.inf:
+            for k in range(n):
+                if scratch.certificate[i, k] == point:
+                    scratch.tried[i] = False
+            if not scratch.tried[i]:
+                scratch.before[i] = scratch.certificate[i]
+
+
+@kernel
+def _accept_swap(ws: Workspace, scratch: RefineScratch, point: int) -> None:
+    """Give `point`, which is out now, the certificate of a point that has come in, the two exchanged."""
+    for i in range(ws.r.shape[0]):
+        scratch.dropped[i] = False
+        if ws.gain[i] == 1.0 and not scratch.kept[i]:
+            for k in range(ws.x.shape[0]):
+                scratch.certificate[point, k] = i if scratch.before[i, k] == point else scratch.before[i, k]
+
+
+@kernel
+def _undo_swap(ws: Workspace, scratch: RefineScratch) -> None:
+    """Go back to the set before; of the new certificates keep those that hold for it, too."""
+    load_vertex(ws, scratch.copies, 1)
+    for i in range(ws.r.shape[0]):
+        if scratch.kept[i]:
+            ws.gain[i] = 1.0
+            ws.cap[i] = 0.0
+        elif ws.gain[i] == 1.0:
+            ws.gain[i] = 0.0
+            ws.cap[i] = np.inf
+            scratch.certificate[i] = scratch.before[i]
+        elif ws.cap[i] == np.inf:
+            for point in scratch.certificate[i]:
+                if point >= 0 and not (scratch.kept[point] or (ws.gain[point] == 0.0 and ws.cap[point] < np.inf)):
+                    scratch.certificate[i] = scratch.before[i]
+                    break
