@@ -9,8 +9,8 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from maxcon.fit import fit as fit
-    from maxcon.fit import methods as methods
+    from maxcon.fitting import fit as fit
+    from maxcon.fitting import methods as methods
     from maxcon.minimax import MinimaxFit as MinimaxFit
     from maxcon.minimax import minimax_fit as minimax_fit
     from maxcon.problem import Consensus as Consensus
@@ -25,10 +25,10 @@ _HOME = {
     "Consensus": "maxcon.problem",
     "LinearProblem": "maxcon.problem",
     "MinimaxFit": "maxcon.minimax",
-    "fit": "maxcon.fit",
+    "fit": "maxcon.fitting",
     "hyperplane": "maxcon.problem",
     "line": "maxcon.problem",
-    "methods": "maxcon.fit",
+    "methods": "maxcon.fitting",
     "minimax_fit": "maxcon.minimax",
     "plane": "maxcon.problem",
 }

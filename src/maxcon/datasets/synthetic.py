@@ -24,9 +24,7 @@ LARGEST_OUTLIER = 5.0
 Sampler = Callable[[np.random.Generator], LinearProblem]
 
 
-def synthetic_hyperplane(
-    rng: np.random.Generator, n_points: int, outlier_rate: float, n_params: int
-) -> LinearProblem:
+def synthetic_hyperplane(rng: np.random.Generator, n_points: int, outlier_rate: float, n_params: int) -> LinearProblem:
     """Return a random problem with `n_params` parameters, the last an intercept, from the paper's protocol.
 
     Parameters

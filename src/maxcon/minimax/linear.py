@@ -36,7 +36,7 @@ def compute_residuals(
     At: NDArray[np.float64], b: NDArray[np.float64], x: NDArray[np.float64], r: NDArray[np.float64]
 ) -> None:
     """Write r = b - At.T @ x[:d]."""
-    for i in range(b.shape[0]):
+    for i in range(r.shape[0]):
         r[i] = b[i]
     _subtract_product(At, x, r)
 
@@ -178,6 +178,45 @@ def refine_vertex(
 
 
 @kernel
+def _is_infeasible(
+    At: NDArray[np.float64],
+    gain: NDArray[np.float64],
+    cap: NDArray[np.float64],
+    x: NDArray[np.float64],
+    q: NDArray[np.int64],
+    g: NDArray[np.float64],
+    w: NDArray[np.float64],
+    step: float,
+) -> bool:
+    """Check Farkas' certificate that a row g, violated by `step`, cannot be kept together with the basis rows.
+
+    With ``g = sum_k w[k] * row k`` and no w[k] > 0, g . x is largest at the vertex. What rounding makes of that,
+    w[k] a little above 0 and g not quite that sum, must be too small to make up for `step`.
+    """
+    n = x.shape[0]
+    reach = 0.0
+    for k in range(n):
+        if q[k] >= 0:
+            i = q[k] >> 1
+            reach += max(w[k], 0.0) * 2.0 * (gain[i] * max(x[n - 1], 1.0) + cap[i])
+        elif q[k] > -n:
+            reach += abs(w[k]) * (1.0 + abs(x[-1 - q[k]]))
+        else:
+            reach += max(w[k], 0.0) * max(x[n - 1], 1.0)
+    for j in range(n):
+        error = g[j]
+        for k in range(n):
+            if q[k] < 0:
+                error -= w[k] if -1 - q[k] == j else 0.0
+            elif j == n - 1:
+                error -= w[k] * gain[q[k] >> 1]
+            else:
+                error -= w[k] * (1.0 - 2.0 * (q[k] & 1)) * At[j, q[k] >> 1]
+        reach += abs(error) * (1.0 + abs(x[j]))
+    return reach < step
+
+
+@kernel
 def dual_simplex(
     At: NDArray[np.float64],
     b: NDArray[np.float64],
@@ -201,6 +240,7 @@ def dual_simplex(
     g, w = table[n], table[n + 1]
     bland = careful
     stalled = 0
+    unsure = False
     last_gamma = x[n - 1]
     for count in range(40 * n + 400):
         if count > 0 and (careful or count % 40 == 0) and not refine_vertex(At, b, gain, cap, C, x, q, table, True):
@@ -222,9 +262,14 @@ def dual_simplex(
         _fill_row(At, gain, name, n, g)
         coefficients(C, g, w)
         leave = leaving_row(C, q, w, bland)
-        if leave < 0:
-            return INFEASIBLE
         step = abs(r[enter]) - (gain[enter] * gamma + cap[enter])
+        if leave < 0:
+            if _is_infeasible(At, gain, cap, x, q, g, w, step):
+                return INFEASIBLE
+            if unsure or not refine_vertex(At, b, gain, cap, C, x, q, table, True):
+                return FAILED
+            unsure = True  # C may have drifted: look again with a fresh one
+            continue
         pivot(C, w, leave)
         for j in range(n):
             x[j] += step * C[j, leave]
@@ -452,6 +497,10 @@ def refit_after_addition(
 
     After STOPPED the vertex belongs to no state: the caller restores the one that it had.
     """
+    if gain[point] == 0.0 and cap[point] < np.inf:  # enforced so far: its row, if tight, would change its meaning
+        status = refit_after_removal(At, b, gain, cap, C, x, q, r, work, table, point)
+        if status != OK:
+            return status
     gain[point] = 1.0
     cap[point] = 0.0
     if abs(r[point]) <= x[x.shape[0] - 1]:
@@ -488,11 +537,14 @@ def refit_after_enforcement(
     gain[point] = 0.0
     cap[point] = threshold
     status = OK
+    sides = 0
     for k in range(n):
         if q[k] >= 0 and q[k] >> 1 == point and was_free:
-            # The row loses its gamma: g' = g - e_n, a change of rank one in G and so in C.
+            # The row loses its gamma: g' = g - e_n, a change of rank one in G and so in C. Not so where both sides
+            # of the point are tight: without gamma they are one row.
             multiplier = C[n - 1, k]
-            if 1.0 - multiplier < 1e-7:
+            sides += 1
+            if sides == 2 or 1.0 - multiplier < 1e-7:
                 status = FAILED
                 break
             for m in range(n):
@@ -501,9 +553,12 @@ def refit_after_enforcement(
                 c = C[j, k]
                 for m in range(n):
                     C[j, m] += c * table[n, m]
-            if not refine_vertex(At, b, gain, cap, C, x, q, table, True):
-                status = FAILED
-                break
+            # x moves along that row's column of C, on which no other basis row changes, to the new residual.
+            gap = (1.0 - 2.0 * (q[k] & 1)) * r[point] - threshold
+            for j in range(n):
+                x[j] += gap * C[j, k]
+    if sides == 1 and status == OK and not refine_vertex(At, b, gain, cap, C, x, q, table, False):
+        status = FAILED
     if status == OK:
         status = dual_simplex(At, b, gain, cap, C, x, q, r, work, table, np.inf, False)
     if status == OK:

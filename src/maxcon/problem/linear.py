@@ -45,9 +45,7 @@ class LinearProblem:
         values = check_array(b, "b", 1)
         n_points, n_params = rows.shape
         if values.shape != (n_points,):
-            raise ValueError(
-                f"b must have one entry for each row of A, ({n_points},), but its shape is {values.shape}"
-            )
+            raise ValueError(f"b must have one entry for each row of A, ({n_points},), but its shape is {values.shape}")
         _check_enough_points(n_points, n_params, "A")
         self._freeze(rows, values, "linear")
 

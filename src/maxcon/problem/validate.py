@@ -99,9 +99,7 @@ def check_indices(value: ArrayLike | None, n_points: int, name: str = "subset") 
         raise ValueError(f"{name} must have 1 dimension, but its shape is {array.shape}")
     if array.dtype.kind == "b":
         if array.shape != (n_points,):
-            raise ValueError(
-                f"{name} must have shape ({n_points},) as a boolean mask, but its shape is {array.shape}"
-            )
+            raise ValueError(f"{name} must have shape ({n_points},) as a boolean mask, but its shape is {array.shape}")
         mask = np.array(array, dtype=np.bool_)
     elif array.size == 0:
         mask = np.zeros(n_points, dtype=np.bool_)

@@ -68,9 +68,7 @@ def any_feasible_set(task: Task) -> NDArray[np.bool_] | None:
     return subset
 
 
-def _infeasible(
-    problem: LinearProblem, threshold: float, method: str, seed: int | None, seconds: float
-) -> Consensus:
+def _infeasible(problem: LinearProblem, threshold: float, method: str, seed: int | None, seconds: float) -> Consensus:
     N = problem.n_points
     return Consensus(
         model=np.full(problem.n_params, np.nan),

@@ -68,7 +68,9 @@ METHODS: dict[str, MethodEntry] = {
     "sweep": MethodEntry(
         "maxcon.search.sweep:exact_sweep", "the proven optimum, d = 2: sweeps the arrangement of lines"
     ),
-    "exact": MethodEntry("maxcon.search.sweep:exact_sweep", "the proven optimum, for d = 2"),
+    "exact": MethodEntry(
+        "maxcon.search.exact:exact", "the proven optimum, d <= 3: branch and bound with interval stabbing"
+    ),
 }
 
 REFINERS: dict[str, str] = {
@@ -155,9 +157,7 @@ def methods() -> dict[str, str]:
 
 def choose_method(problem: LinearProblem) -> str:
     """Return what "auto" means for `problem`: the proven optimum where it is cheap, else what finds most."""
-    if problem.n_params == 2:
-        return "exact"
-    return "agent" if problem.family == "plane" else "greedy"
+    return "exact" if problem.n_params <= 3 else "peel"
 
 
 def _check_rng(rng: Any) -> tuple[np.random.Generator, int | None]:

@@ -1,0 +1,342 @@
+"""Rows of a linear problem as strips, the form in which exact stabbing takes them.
+
+Of the r <= 3 independent columns of A one is singled out, the stabbing column c; its parameter is t. Divided by c_i,
+point i is an inlier where ``|x_i . s + t - y_i| <= l_i``, with k = r - 1 parameters s: a strip of the (s, t) space. Points
+with c_i = 0 are strips too, but do not depend on t: *flat* ones. A point whose row is 0 is an inlier always or never.
+
+An exact change of parameters makes the numbers tame: x is centred at a median, t moves to a model that was sampled
+(and that is the first incumbent), s is counted from that model, too, in powers of two, and of two correlated
+columns one loses its regression on the other. Parameters without bounds become homogeneous: for a model (s, t) take
+(sigma, w, tau) = w (s, t, 1), scaled such that the largest of |sigma_j| and w is 1. So every strip is
+``w low_i <= a_i . sigma + tau <= w high_i`` over the faces of a cube, w = 0 standing for "infinitely steep".
+
+What rounding does. Every number is computed from the floats of A and b, one point at a time, by a handful of
+operations, each of which is off by at most u = 2^-53 times its result. `pad` is 2^-48 = 32 u times the sum of
+the sizes of all that is added on the way to an edge, and |sigma_j|, w <= 1: so an edge moved out by `pad` is
+outside of where exact arithmetic would put it. As equal rows are treated alike, duplicates stay duplicates.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from maxcon.minimax.jit import kernel
+
+#: 32 units of rounding; the longest chain of operations from the data to an edge has about 20.
+ROUNDING = 2.0**-48
+
+#: Rows with larger (or thresholds with smaller) numbers than this, after division by c_i, are left out of the search
+#: and counted as inliers of everything in the bound.
+EXTREME = 1e100
+
+#: How many minimal samples are tried for the first incumbent, on at most three times as many points.
+SAMPLES = 64
+
+
+class Strips(NamedTuple):
+    """The strips ``w low <= a0 sigma_0 + a1 sigma_1 + tau <= w high``; the last ones are flat (no tau).
+
+    Attributes
+    ----------
+    a0, a1, low, high
+        Shape (n,) each; a1 = 0 where k = 1.
+    pad
+        Shape (n,): how far rounding can have moved an edge, anywhere on the cube.
+    grain
+        Shape (n,): the same for a_i alone: rows that differ by no more are equal.
+    marks
+        Shape (n,), uint64: bit j says that the strip belongs to group j of dependent rows, which has been solved.
+    n_regular
+        How many are not flat; these come first.
+    """
+
+    a0: NDArray[np.float64]
+    a1: NDArray[np.float64]
+    low: NDArray[np.float64]
+    high: NDArray[np.float64]
+    pad: NDArray[np.float64]
+    grain: NDArray[np.float64]
+    marks: NDArray[np.uint64]
+    n_regular: int
+
+
+@kernel
+def stabbing_column(A: NDArray[np.float64], columns: NDArray[np.int64]) -> tuple[int, bool]:
+    """Return which of `columns` to stab along, as a place in `columns`, and whether it is constant.
+
+    A constant one if there is one; else the one with the fewest entries that are small or 0, since dividing by those
+    makes wide strips, which bound poorly.
+    """
+    N = A.shape[0]
+    best = 0
+    fewest = N + 1
+    for k in range(columns.shape[0]):
+        j = columns[k]
+        largest = 0.0
+        constant = True
+        for i in range(N):
+            largest = max(largest, abs(A[i, j]))
+            constant = constant and A[i, j] == A[0, j]
+        if constant:
+            return k, True
+        small = 0
+        for i in range(N):
+            small += abs(A[i, j]) < 0.125 * largest
+        if small < fewest:
+            fewest = small
+            best = k
+    return best, False
+
+
+@kernel
+def _power_of_two(x: float) -> float:
+    """Return the power of two nearest to x > 0, within 2^-200 to 2^200."""
+    return float(2.0 ** min(max(np.round(np.log2(x)), -200.0), 200.0))
+
+
+@kernel
+def _middle(values: NDArray[np.float64], n: int) -> float:
+    """Return the median of the first n entries (it sorts them)."""
+    for j in range(1, n):
+        value = values[j]
+        k = j
+        while k > 0 and values[k - 1] > value:
+            values[k] = values[k - 1]
+            k -= 1
+        values[k] = value
+    return values[n // 2]
+
+
+@kernel
+def _divide(
+    A: NDArray[np.float64],
+    b: NDArray[np.float64],
+    limit: float,
+    columns: NDArray[np.int64],
+    constant: bool,
+    x: NDArray[np.float64],
+    y: NDArray[np.float64],
+    reach: NDArray[np.float64],
+    order: NDArray[np.int64],
+) -> tuple[int, int, int, int]:
+    """Write x, y, l (`reach`) and the point of each strip (`order`).
+
+    Returns the number of regular strips, of strips, of points that are always inliers (their indices are at the end
+    of `order`), and of points left out because their numbers are extreme.
+    """
+    N = A.shape[0]
+    k = columns.shape[0] - 1
+    scale = np.ones(3)
+    for j in range(k + 1):
+        largest = 0.0
+        for i in range(N):
+            largest = max(largest, abs(A[i, columns[j]]))
+        scale[j] = 1.0 / _power_of_two(largest) if largest > 0.0 else 1.0
+    largest = limit
+    for i in range(N):
+        largest = max(largest, abs(b[i]))
+    to_y = 1.0 / _power_of_two(largest)
+
+    n = 0
+    n_regular = 0
+    always = 0
+    left_out = 0
+    for flat in range(2):
+        for i in range(N):
+            c = 1.0 if constant else A[i, columns[k]] * scale[k]
+            if (c == 0.0) != (flat == 1):
+                continue
+            if flat:
+                c = 1.0
+            size = 0.0
+            for j in range(k):
+                x[j, n] = A[i, columns[j]] * scale[j] / c
+                size = max(size, abs(x[j, n]))
+            y[n] = b[i] * to_y / c
+            reach[n] = limit * to_y / abs(c)
+            if flat and size == 0.0:
+                if abs(b[i]) <= limit:
+                    always += 1
+                    order[N - always] = i
+            elif not (max(size, abs(y[n])) < EXTREME and 1.0 / EXTREME < reach[n] < EXTREME):
+                left_out += 1
+            else:
+                order[n] = i
+                n += 1
+        if flat == 0:
+            n_regular = n
+    return n_regular, n, always, left_out
+
+
+@kernel
+def _centre(
+    row: NDArray[np.float64],
+    n_regular: int,
+    exact: bool,
+    draws: NDArray[np.float64],
+    size: NDArray[np.float64],
+) -> None:
+    """Centre the regular part of a column at a sampled median; write the sizes of what was rounded into `size`."""
+    values = np.empty(SAMPLES)
+    for q in range(SAMPLES):
+        values[q] = row[int(draws[q, 0] * n_regular)]
+    centre = _middle(values, SAMPLES)
+    for i in range(row.shape[0]):
+        size[i] = abs(row[i])
+        if i < n_regular:
+            row[i] -= centre
+            size[i] = abs(row[i]) if exact else size[i] + abs(centre)
+
+
+@kernel
+def _decorrelate(
+    x: NDArray[np.float64], n: int, n_regular: int, draws: NDArray[np.float64], size: NDArray[np.float64]
+) -> None:
+    """Subtract a multiple of column 1 from column 0 where they are correlated: a narrow valley makes many boxes.
+
+    The factor has 8 bits, so that data on a grid stay on a grid.
+    """
+    xx = xy = yy = 0.0
+    for q in range(SAMPLES):
+        i = int(draws[q, 1] * n_regular)
+        xx += x[0, i] * x[0, i]
+        xy += x[0, i] * x[1, i]
+        yy += x[1, i] * x[1, i]
+    if not (0.5 * xx * yy < xy * xy < np.inf):
+        return
+    factor = xy / yy
+    unit = _power_of_two(abs(factor)) / 256.0
+    factor = np.round(factor / unit) * unit
+    for i in range(n):
+        step = factor * x[1, i]
+        x[0, i] -= step
+        size[i] += abs(step)
+
+
+@kernel
+def _sample_model(
+    x: NDArray[np.float64],
+    y: NDArray[np.float64],
+    reach: NDArray[np.float64],
+    k: int,
+    n_regular: int,
+    draws: NDArray[np.float64],
+    model: NDArray[np.float64],
+) -> None:
+    """Write the best (s_0, s_1, t) of some minimal samples of regular strips into `model`."""
+    tested = min(n_regular, 3 * SAMPLES)
+    x0, x1, yt, lt = np.empty(tested), np.empty(tested), np.empty(tested), np.empty(tested)
+    for e in range(tested):
+        i = e if tested == n_regular else int(draws[e // 3, e % 3] * n_regular)
+        x0[e], x1[e], yt[e], lt[e] = x[0, i], x[1, i], y[i], reach[i]
+    model[0] = model[1] = 0.0
+    model[2] = y[int(draws[0, 0] * n_regular)]
+    best = 0
+    for q in range(SAMPLES):
+        i = int(draws[q, 0] * n_regular)
+        j = int(draws[q, 1] * n_regular)
+        m = int(draws[q, 2] * n_regular)
+        p0, p1, py = x[0, j] - x[0, i], x[1, j] - x[1, i], y[j] - y[i]
+        q0, q1, qy = x[0, m] - x[0, i], x[1, m] - x[1, i], y[m] - y[i]
+        if k == 1:
+            q0, q1, qy = 0.0, 1.0, 0.0
+        run = p0 * q1 - p1 * q0
+        s0 = (py * q1 - p1 * qy) / run
+        s1 = (p0 * qy - py * q0) / run
+        t = y[i] - s0 * x[0, i] - s1 * x[1, i]
+        if run == 0.0 or not (abs(s0) + abs(s1) + abs(t) < EXTREME):
+            continue
+        count = 0
+        for e in range(tested):
+            count += abs(yt[e] - s0 * x0[e] - s1 * x1[e] - t) <= lt[e]
+        if count > best:
+            best = count
+            model[0], model[1], model[2] = s0, s1, t
+
+
+@kernel
+def _unit(row: NDArray[np.float64], n_regular: int, height: float, draws: NDArray[np.float64]) -> float:
+    """Return the power of two in which a parameter is counted: a change by 1 moves most edges by about `height`."""
+    values = np.empty(SAMPLES)
+    for q in range(SAMPLES):
+        values[q] = abs(row[int(draws[q, 1] * n_regular)])
+    spread = _middle(values, SAMPLES)
+    if spread == 0.0:
+        for i in range(row.shape[0]):
+            spread = max(spread, abs(row[i]))
+    return _power_of_two(height / spread) if spread > 0.0 else 1.0
+
+
+@kernel
+def make_strips(
+    A: NDArray[np.float64],
+    b: NDArray[np.float64],
+    limit: float,
+    columns: NDArray[np.int64],
+    constant: bool,
+    draws: NDArray[np.float64],
+    strips: Strips,
+    order: NDArray[np.int64],
+) -> tuple[int, int, int, int]:
+    """Fill `strips` (arrays of length N) and `order`; the sampled model becomes (sigma, w, tau) = (0, 0, 1, 0).
+
+    Parameters
+    ----------
+    A, b, limit
+        The data, shapes (N, d) and (N,), and the largest residual of an inlier.
+    columns
+        The r = 2 or 3 independent columns of A, the stabbing column last.
+    constant
+        Whether that one is constant.
+    draws
+        Shape (SAMPLES, 3): random numbers in [0, 1).
+    strips, order
+        Output; `order` holds the point of each strip.
+
+    Returns
+    -------
+    The number of regular strips, of strips, of points that are always inliers (their indices are at the end of
+    `order`), and of points left out because their numbers are extreme.
+    """
+    N = A.shape[0]
+    k = columns.shape[0] - 1
+    x, size = np.zeros((2, N)), np.zeros((2, N))
+    y, reach = np.empty(N), np.empty(N)
+    n_regular, n, always, left_out = _divide(A, b, limit, columns, constant, x, y, reach, order)
+    model = np.zeros(3)
+    if n_regular > 0:
+        for j in range(k):
+            _centre(x[j, :n], n_regular, constant, draws, size[j])
+        if k == 2:
+            _decorrelate(x, n, n_regular, draws, size[0])
+        _sample_model(x, y, reach, k, n_regular, draws, model)
+
+    pad, grain = strips.pad, strips.grain
+    values = np.empty(SAMPLES)
+    for i in range(n):
+        offset = model[2] if i < n_regular else 0.0
+        pad[i] = abs(y[i]) + abs(offset) + reach[i]
+        y[i] -= offset
+        for j in range(k):
+            y[i] -= x[j, i] * model[j]
+            pad[i] += (abs(x[j, i]) + size[j, i]) * abs(model[j])
+    unit0 = unit1 = 1.0
+    if n_regular > 0:
+        for q in range(SAMPLES):
+            i = int(draws[q, 2] * n_regular)
+            values[q] = max(abs(y[i]), 2.0 * reach[i])
+        height = _middle(values, SAMPLES)
+        unit0 = _unit(x[0, :n], n_regular, height, draws)
+        unit1 = _unit(x[1, :n], n_regular, height, draws)
+    for i in range(n):
+        strips.a0[i] = x[0, i] * unit0
+        strips.a1[i] = x[1, i] * unit1
+        strips.low[i] = y[i] - reach[i]
+        strips.high[i] = y[i] + reach[i]
+        grain[i] = ROUNDING * (size[0, i] * unit0 + size[1, i] * unit1)
+        pad[i] = ROUNDING * (pad[i] + abs(y[i]) + abs(strips.a0[i]) + abs(strips.a1[i])) + grain[i]
+        strips.marks[i] = 0
+    return n_regular, n, always, left_out

@@ -1,0 +1,206 @@
+"""The front door: its arguments, its result, and the loop behind it."""
+
+import dataclasses
+import time
+
+import numpy as np
+import pytest
+
+import maxcon
+import maxcon.fitting
+from instances import FAMILIES
+from maxcon.datasets.synthetic import synthetic_hyperplane
+from maxcon.search.anytime import Progress, Step, make_task, run
+from oracles import default_slack, highs_minimax
+
+METHODS = tuple(maxcon.methods())
+
+
+@pytest.fixture
+def problem():
+    return synthetic_hyperplane(np.random.default_rng(1), 60, 0.4, 2)
+
+
+def serves(method, problem):
+    largest = {"sweep": 2, "agent": 3, "exact": 3}
+    return problem.n_params <= largest.get(method, 99)
+
+
+def check(result, problem, threshold):
+    """Everything that a Consensus promises."""
+    limit = threshold + default_slack(threshold, problem.b)
+    if result.status == "infeasible":
+        assert result.n_inliers == result.upper_bound == 0
+        assert np.isnan(result.model).all()
+        return
+    residuals = np.abs(problem.A @ result.model - problem.b)
+    assert np.allclose(result.residuals, residuals, rtol=1e-12, atol=1e-12 * problem.scale)
+    assert np.array_equal(result.inlier_mask, result.residuals <= limit)
+    assert result.n_inliers == result.inlier_mask.sum() > 0
+    assert result.n_inliers <= result.upper_bound <= problem.n_points
+    assert result.gap == result.upper_bound - result.n_inliers
+    assert result.status == {True: "optimal"}.get(result.gap == 0, result.status)
+    mask = result.inlier_mask
+    value = highs_minimax(problem.A[mask], problem.b[mask])
+    assert residuals[mask].max() == pytest.approx(value, rel=1e-8, abs=1e-11 * problem.scale)
+    assert result.inlier_mask[result.basis].all()
+    assert len(set(result.path.tolist())) == len(result.path)
+
+
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("n_params", [2, 3, 5])
+def test_every_method_keeps_what_a_consensus_promises(method, n_params):
+    problem = synthetic_hyperplane(np.random.default_rng(n_params), 40, 0.3, n_params)
+    if not serves(method, problem):
+        with pytest.raises(ValueError, match=r"parameters, but this one has|families"):
+            maxcon.fit(problem, 0.1, method=method)
+        return
+    for refine in (None, "tree", "swap"):
+        result = maxcon.fit(problem, 0.1, method=method, refine=refine, time_limit=2)
+        check(result, problem, 0.1)
+        assert result.method == method
+        again = maxcon.fit(problem, 0.1, method=method, refine=refine, time_limit=2)
+        assert np.array_equal(again.inlier_mask, result.inlier_mask)
+
+
+@pytest.mark.parametrize("family", FAMILIES)
+def test_degenerate_data(family):
+    rng = np.random.default_rng(len(family))
+    A, b = FAMILIES[family](rng)
+    problem = maxcon.LinearProblem(A, b)
+    threshold = float(np.quantile(np.abs(b - np.median(b)), 0.3)) + 1e-6 * problem.scale + 1e-9
+    for method in ("greedy", "random", "lo-ransac", "auto"):
+        check(maxcon.fit(problem, threshold, method=method, time_limit=1), problem, threshold)
+
+
+def test_the_name_fit_is_the_function_whatever_was_imported_first():
+    assert callable(maxcon.fit)
+    assert maxcon.fit is maxcon.fitting.fit
+
+
+def test_no_seed_and_the_same_seed_give_the_same_answer(problem):
+    one, two = (maxcon.fit(problem, 0.1, method="random", refine=None) for _ in range(2))
+    assert np.array_equal(one.path, two.path)
+    assert one.seed == 0
+    other = maxcon.fit(problem, 0.1, method="random", refine=None, rng=1)
+    assert not np.array_equal(one.path, other.path)
+    assert maxcon.fit(problem, 0.1, rng=np.random.default_rng(3)).seed is None
+
+
+def test_refinement_never_loses(problem):
+    for seed in range(10):
+        sizes = [
+            maxcon.fit(problem, 0.1, method="random", rng=seed, refine=refine).n_inliers
+            for refine in (None, "tree", "swap")
+        ]
+        assert sizes == sorted(sizes)
+
+
+def test_no_model_is_a_status():
+    nothing = maxcon.LinearProblem(np.zeros((5, 2)), [1.0, 2, 3, 4, 5])
+    for method in ("greedy", "random", "exact", "lo-ransac", "auto"):
+        result = maxcon.fit(nothing, 0.5, method=method)
+        assert result.status == "infeasible"
+        assert (result.n_inliers, result.upper_bound, result.gap) == (0, 0, 0)
+
+
+def test_one_feasible_point_is_a_model():
+    lonely = maxcon.LinearProblem(np.zeros((5, 2)), [1.0, 2, 3, 4, 0.2])
+    for method in ("greedy", "exact", "lo-ransac"):
+        assert maxcon.fit(lonely, 0.5, method=method).inlier_mask.tolist() == [False] * 4 + [True]
+
+
+def test_all_points_fit():
+    result = maxcon.fit(maxcon.line(np.arange(9.0), np.arange(9.0)), 0.1)
+    assert result.n_inliers == result.upper_bound == 9
+    assert result.status == "optimal"
+
+
+def test_the_result_is_frozen(problem):
+    result = maxcon.fit(problem, 0.1)
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        result.n_inliers = 3
+
+
+@pytest.mark.parametrize(
+    ("changes", "kind", "message"),
+    [
+        ({"problem": [[1, 2]]}, TypeError, "problem must be a LinearProblem"),
+        ({"threshold": 0}, ValueError, "threshold must be a positive"),
+        ({"threshold": -1.0}, ValueError, "threshold must be a positive"),
+        ({"threshold": float("nan")}, ValueError, "threshold must be a positive"),
+        ({"threshold": float("inf")}, ValueError, "threshold must be a positive"),
+        ({"threshold": "1"}, TypeError, "threshold must be a number"),
+        ({"method": "best"}, ValueError, "method must be 'auto' or one of"),
+        ({"method": 3}, TypeError, "method must be a string"),
+        ({"rng": -1}, ValueError, "rng must be a seed"),
+        ({"rng": "x"}, TypeError, "rng must be None, a seed"),
+        ({"time_limit": 0}, ValueError, "time_limit must be a positive"),
+        ({"time_limit": float("nan")}, ValueError, "time_limit must be a positive"),
+        ({"time_limit": "1"}, TypeError, "time_limit must be a number"),
+        ({"refine": "swop"}, ValueError, "refine must be 'tree', 'swap' or None"),
+        ({"refine": 1}, TypeError, "refine must be 'tree', 'swap' or None"),
+        ({"gap": -1}, ValueError, "gap must be at least 0"),
+        ({"gap": 0.5}, TypeError, "gap must be a whole number"),
+        ({"callback": 3}, TypeError, "callback must be callable"),
+        ({"method": "greedy", "tries": 3}, TypeError, "unknown option 'tries' for method 'greedy'"),
+        ({"method": "random", "tries": 0}, ValueError, "tries must be a positive integer"),
+        ({"method": "agent", "temperature": 0}, ValueError, "temperature must be positive"),
+        ({"method": "agent", "weights": "nowhere.safetensors"}, ValueError, "weights must name an agent file"),
+    ],
+)
+def test_bad_arguments_are_named(problem, changes, kind, message):
+    arguments = {"problem": problem, "threshold": 0.1, **changes}
+    with pytest.raises(kind, match=message):
+        maxcon.fit(arguments.pop("problem"), arguments.pop("threshold"), **arguments)
+
+
+def feasible_sets(problem):
+    """Ever larger prefixes of the inliers of an optimal fit."""
+    order = np.flatnonzero(maxcon.fit(problem, 0.1).inlier_mask)
+    for size in range(1, len(order) + 1):
+        subset = np.zeros(problem.n_points, dtype=np.bool_)
+        subset[order[:size]] = True
+        yield Step(subset=subset, upper_bound=problem.n_points - size)
+
+
+def test_the_loop_keeps_the_best_and_tells_the_callback(problem):
+    seen: list[Progress] = []
+    task = make_task(problem, 0.1, np.random.default_rng(0))
+    best = run(task, feasible_sets(problem), callback=seen.append)
+    assert [each.n_inliers for each in seen] == list(range(1, best.size + 1))
+    assert [each.upper_bound for each in seen] == [60 - each.n_inliers for each in seen]
+
+
+def test_the_loop_stops_on_the_callbacks_word(problem):
+    task = make_task(problem, 0.1, np.random.default_rng(0))
+    assert run(task, feasible_sets(problem), callback=lambda progress: progress.n_inliers == 5).size == 5
+
+
+def test_the_loop_stops_at_the_gap(problem):
+    task = make_task(problem, 0.1, np.random.default_rng(0), gap=40)
+    best = run(task, feasible_sets(problem))
+    assert best.size == 10
+    assert best.gap == 40
+
+
+def test_the_loop_stops_at_the_deadline_and_on_ctrl_c(problem):
+    def endless():
+        yield from list(feasible_sets(problem))[:7]
+        while True:
+            time.sleep(0.001)
+            yield Step()
+
+    def interrupted():
+        yield from list(feasible_sets(problem))[:7]
+        raise KeyboardInterrupt
+
+    assert run(make_task(problem, 0.1, np.random.default_rng(0), time_limit=0.05), endless()).size == 7
+    best = run(make_task(problem, 0.1, np.random.default_rng(0)), interrupted())
+    assert best.size == 7
+    assert best.interrupted
+
+
+def test_stopped_before_the_first_step_there_is_still_a_model(problem):
+    result = maxcon.fit(problem, 0.1, method="random", time_limit=1e-9)
+    check(result, problem, 0.1)
