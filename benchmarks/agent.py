@@ -31,7 +31,7 @@ REPEATS = 15
 
 @kernel
 def replay(workspace: Workspace, path: NDArray[np.int64]) -> None:
-    """The minimax fits of a walk alone: the cold one of all points, and the warm one after each removal."""
+    """Do the minimax fits of a walk alone: the cold one of all points, and the warm one after each removal."""
     At, b, gain, cap, C, x, q, r, work, table = workspace
     gain[:] = 1.0
     cap[:] = 0.0
@@ -53,7 +53,8 @@ def fastest(function: Callable[[], object]) -> float:
 
 def main() -> None:
     print(f"{platform.processor() or platform.machine()}, {os.cpu_count()} cores, one thread used")
-    print(f"{'model':8}{'N':>6}{'rate':>6}{'removals':>10}{'fit us':>10}{'minimax us':>12}{'ratio':>8}   target: ratio <= 100 (line, N=100, 50%)")
+    print("target: a ratio of at most 100 (line, N = 100, 50%)")
+    print(f"{'model':8}{'N':>6}{'rate':>6}{'removals':>10}{'fit us':>10}{'minimax us':>12}{'ratio':>8}")
     for n_params, name in ((2, "line"), (3, "plane")):
         for n_points, rate in ((100, 0.3), (100, 0.5), (200, 0.5)):
             rows = []

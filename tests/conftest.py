@@ -1,4 +1,4 @@
-"""One thread for BLAS and torch: the tests' matrices are small, and waking threads for them takes longer than the work."""
+"""One thread for BLAS and torch: the tests' matrices are small, and waking threads takes longer than the work."""
 
 import os
 

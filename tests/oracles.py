@@ -376,9 +376,7 @@ def _first_basis(
 # ----------------------------------------------------------------------------------------------- consensus
 
 
-def brute_force_consensus(
-    A: npt.ArrayLike, b: npt.ArrayLike, threshold: float, slack: float | None = None
-) -> int:
+def brute_force_consensus(A: npt.ArrayLike, b: npt.ArrayLike, threshold: float, slack: float | None = None) -> int:
     """Return the largest number of points with f(S) <= threshold + slack, exactly, for N <= 16.
 
     f(S) is the largest value of a circuit inside S (see `exact_minimax`; this is Helly's theorem with the
@@ -407,9 +405,7 @@ def brute_force_consensus(
     return int(np.bitwise_count(masks[fits]).max())
 
 
-def line_consensus_bruteforce(
-    x: npt.ArrayLike, y: npt.ArrayLike, threshold: float, slack: float | None = None
-) -> int:
+def line_consensus_bruteforce(x: npt.ArrayLike, y: npt.ArrayLike, threshold: float, slack: float | None = None) -> int:
     """Return the most points with |m x + c - y| <= limit = threshold + slack, exactly: O(N^3), N <= 40 or so.
 
     Take the best set. If it has two different x, the lines (m, c) that fit it form a bounded polygon; at one

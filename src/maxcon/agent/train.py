@@ -204,7 +204,7 @@ def _bar(show: bool, total: int, done: int) -> Iterator[Any]:
         def advance(updates: int, gaps: dict[float, float] | None) -> None:
             display.update(task, completed=updates)
             if gaps is not None:
-                display.update(task, gap=", ".join(f"{gap:.2f} at {rate:.0%}" for rate, gap in gaps.items()))
+                display.update(task, gap=" / ".join(f"{gap:.1f}" for gap in gaps.values()))
 
         yield advance
 

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from maxcon.minimax.linear import OK, basis_points, cold_fit
-from maxcon.minimax.rows import linear_rows
+from maxcon.minimax.rows import linear_rows, whiten
 from maxcon.minimax.workspace import allocate
 from maxcon.problem import LinearProblem, check_indices
 
@@ -24,8 +24,8 @@ class MinimaxFit:
     value
         f(S): that largest residual, in the unit of b.
     basis
-        Indices of the points that hold the fit in place, ascending, at most d + 1: removing one of them
-        (and no other point) lowers the value.
+        Indices of the points that hold the fit in place, ascending, at most d + 1: their value alone is f(S), so
+        that only removing one of them can lower it (and does, unless another point ties with it).
     """
 
     model: NDArray[np.float64]
@@ -60,10 +60,16 @@ def minimax_fit(problem: LinearProblem, subset: ArrayLike | None = None) -> Mini
     mask = check_indices(subset, problem.n_points)
     rows = linear_rows(problem)
     workspace = allocate(rows, mask)
+    names = np.arange(problem.n_points)
     if cold_fit(*workspace) != OK:
-        raise ArithmeticError("the minimax fit did not converge; please report the data that made this happen")
-    basis = np.empty(problem.n_params + 1, dtype=np.int64)
+        # A few points of a narrow range: whitened with the others, their rows are dependent but for rounding.
+        names = np.flatnonzero(mask)
+        rows = whiten(problem.A[mask], problem.b[mask])
+        workspace = allocate(rows)
+        if cold_fit(*workspace) != OK:
+            raise ArithmeticError("the minimax fit did not converge; please report the data that made this happen")
+    basis = np.empty(workspace.q.shape[0], dtype=np.int64)
     size = basis_points(workspace.C, workspace.q, basis)
     model = rows.model(workspace.x)
     value = float(np.abs(problem.A[mask] @ model - problem.b[mask]).max())
-    return MinimaxFit(model, value, basis[:size].copy())
+    return MinimaxFit(model, value, names[basis[:size]])

@@ -27,8 +27,15 @@ INFEASIBLE = 1
 FAILED = 2  # rounding defeated the pivots; callers start again cold
 STOPPED = 3  # gamma has passed `stop_above`
 
-#: A row is violated when it is by more than this, times 1 + |x|: the rounding of a residual of whitened rows.
+#: A row is violated when it is by more than this, times the size of its residual (see `_tolerance`): some hundred
+#: times what rounding does to it.
 FEASIBILITY_TOLERANCE = 3e-14
+
+#: What no row of whitened data can be said to be violated by: b is at most 1.
+ROUNDING = 1e-15
+
+#: Enforced points that meet at their thresholds, but for rounding, can be kept: a tenth of the slack of a threshold.
+DOUBT_TOLERANCE = 1e-10
 
 
 @kernel
@@ -45,13 +52,18 @@ def compute_residuals(
 def _subtract_product(At: NDArray[np.float64], x: NDArray[np.float64], r: NDArray[np.float64]) -> None:
     d, N = At.shape
     j = 0
-    while j + 2 < d:  # three directions a pass: memory traffic, not arithmetic, is what costs
+    while j + 3 < d:  # four directions a pass: memory traffic, not arithmetic, is what costs
+        x0, x1, x2, x3 = x[j], x[j + 1], x[j + 2], x[j + 3]
+        a0, a1, a2, a3 = At[j], At[j + 1], At[j + 2], At[j + 3]
+        for i in range(N):
+            r[i] -= (a0[i] * x0 + a1[i] * x1) + (a2[i] * x2 + a3[i] * x3)
+        j += 4
+    if j + 2 < d:
         x0, x1, x2 = x[j], x[j + 1], x[j + 2]
         a0, a1, a2 = At[j], At[j + 1], At[j + 2]
         for i in range(N):
             r[i] -= a0[i] * x0 + a1[i] * x1 + a2[i] * x2
-        j += 3
-    if j + 1 < d:
+    elif j + 1 < d:
         x0, x1 = x[j], x[j + 1]
         a0, a1 = At[j], At[j + 1]
         for i in range(N):
@@ -90,16 +102,41 @@ def _most_violated(
 
 @kernel
 def _first_violated(
-    r: NDArray[np.float64],
+    At: NDArray[np.float64],
+    b: NDArray[np.float64],
     gain: NDArray[np.float64],
     cap: NDArray[np.float64],
-    gamma: float,
-    tolerance: float,
+    x: NDArray[np.float64],
+    r: NDArray[np.float64],
 ) -> int:
+    gamma = x[x.shape[0] - 1]
     for i in range(r.shape[0]):
-        if abs(r[i]) - (gain[i] * gamma + cap[i]) > tolerance:
+        excess = abs(r[i]) - (gain[i] * gamma + cap[i])
+        if excess > 0.0 and excess > _tolerance(At, b, gain, cap, x, i):
             return i
     return -1
+
+
+@kernel
+def _tolerance(
+    At: NDArray[np.float64],
+    b: NDArray[np.float64],
+    gain: NDArray[np.float64],
+    cap: NDArray[np.float64],
+    x: NDArray[np.float64],
+    i: int,
+) -> float:
+    """Return what point i may be violated by and still count as kept: the rounding of the sum that its residual is.
+
+    A short row among long ones (that may all be removed) has a small sum of large x.
+    """
+    d = At.shape[0]
+    own = abs(b[i]) + gain[i] * abs(x[d]) + cap[i]
+    common = 1.0 + abs(x[d])
+    for j in range(d):
+        own += abs(At[j, i] * x[j])
+        common += abs(x[j])
+    return float(FEASIBILITY_TOLERANCE * min(own, common))
 
 
 @kernel
@@ -115,14 +152,6 @@ def _fill_row(At: NDArray[np.float64], gain: NDArray[np.float64], name: int, n: 
     for j in range(n - 1):
         g[j] = sign * At[j, i]
     g[n - 1] = gain[i]
-
-
-@kernel
-def _tolerance(x: NDArray[np.float64]) -> float:
-    size = 1.0
-    for j in range(x.shape[0]):
-        size += abs(x[j])
-    return FEASIBILITY_TOLERANCE * size
 
 
 @kernel
@@ -145,8 +174,10 @@ def refine_vertex(
     gap = table[n]
     for attempt in range(3):
         worst = 0.0
+        settled = True
         for k in range(n):
             name = q[k]
+            allowed = FEASIBILITY_TOLERANCE
             if name < 0:
                 gap[k] = -x[n - 1] if name == -n else 0.0
             else:
@@ -156,9 +187,11 @@ def refine_vertex(
                 for j in range(n - 1):
                     value -= sign * At[j, i] * x[j]
                 gap[k] = value
+                allowed = _tolerance(At, b, gain, cap, x, i)
             worst = max(worst, abs(gap[k]))
+            settled = settled and abs(gap[k]) <= 0.3 * allowed
         if not always or attempt > 0:
-            if worst <= _tolerance(x) * 0.3:
+            if settled:
                 return True
             if attempt == 0 and worst <= 1e-9:
                 for j in range(n):
@@ -178,7 +211,7 @@ def refine_vertex(
 
 
 @kernel
-def _is_infeasible(
+def _doubt(
     At: NDArray[np.float64],
     gain: NDArray[np.float64],
     cap: NDArray[np.float64],
@@ -186,23 +219,22 @@ def _is_infeasible(
     q: NDArray[np.int64],
     g: NDArray[np.float64],
     w: NDArray[np.float64],
-    step: float,
-) -> bool:
-    """Check Farkas' certificate that a row g, violated by `step`, cannot be kept together with the basis rows.
+) -> float:
+    """Return how far a row g with no row to leave for it must be violated before that proves infeasibility.
 
-    With ``g = sum_k w[k] * row k`` and no w[k] > 0, g . x is largest at the vertex. What rounding makes of that,
-    w[k] a little above 0 and g not quite that sum, must be too small to make up for `step`.
+    With ``g = sum_k w[k] * row k`` and no w[k] > 0 (Farkas' certificate), g . x is largest at the vertex. This is what
+    rounding may add: a w[k] a little above 0, and g not quite that sum.
     """
     n = x.shape[0]
-    reach = 0.0
+    doubt = 0.0
     for k in range(n):
         if q[k] >= 0:
             i = q[k] >> 1
-            reach += max(w[k], 0.0) * 2.0 * (gain[i] * max(x[n - 1], 1.0) + cap[i])
+            doubt += max(w[k], 0.0) * 2.0 * (gain[i] * max(x[n - 1], 1.0) + cap[i])
         elif q[k] > -n:
-            reach += abs(w[k]) * (1.0 + abs(x[-1 - q[k]]))
+            doubt += abs(w[k]) * (1.0 + abs(x[-1 - q[k]]))
         else:
-            reach += max(w[k], 0.0) * max(x[n - 1], 1.0)
+            doubt += max(w[k], 0.0) * max(x[n - 1], 1.0)
     for j in range(n):
         error = g[j]
         for k in range(n):
@@ -212,8 +244,8 @@ def _is_infeasible(
                 error -= w[k] * gain[q[k] >> 1]
             else:
                 error -= w[k] * (1.0 - 2.0 * (q[k] & 1)) * At[j, q[k] >> 1]
-        reach += abs(error) * (1.0 + abs(x[j]))
-    return reach < step
+        doubt += abs(error) * (1.0 + abs(x[j]))
+    return doubt
 
 
 @kernel
@@ -240,20 +272,19 @@ def dual_simplex(
     g, w = table[n], table[n + 1]
     bland = careful
     stalled = 0
-    unsure = False
+    fresh = False
     last_gamma = x[n - 1]
     for count in range(40 * n + 400):
         if count > 0 and (careful or count % 40 == 0) and not refine_vertex(At, b, gain, cap, C, x, q, table, True):
             return FAILED
         compute_residuals(At, b, x, r)
-        tolerance = _tolerance(x)
         gamma = x[n - 1]
         if bland:
-            enter = _first_violated(r, gain, cap, gamma, tolerance)
+            enter = _first_violated(At, b, gain, cap, x, r)
         else:
             enter = _most_violated(r, gain, cap, gamma, work[0, :N])
-            if enter >= 0 and work[0, enter] <= tolerance:
-                enter = -1
+            if enter >= 0 and work[0, enter] <= _tolerance(At, b, gain, cap, x, enter):
+                enter = _first_violated(At, b, gain, cap, x, r) if work[0, enter] > ROUNDING else -1
         if enter < 0:
             return OK
         if not (abs(r[enter]) < np.inf):
@@ -264,19 +295,23 @@ def dual_simplex(
         leave = leaving_row(C, q, w, bland)
         step = abs(r[enter]) - (gain[enter] * gamma + cap[enter])
         if leave < 0:
-            if _is_infeasible(At, gain, cap, x, q, g, w, step):
+            doubt = _doubt(At, gain, cap, x, q, g, w)
+            if step > doubt:
                 return INFEASIBLE
-            if unsure or not refine_vertex(At, b, gain, cap, C, x, q, table, True):
-                return FAILED
-            unsure = True  # C may have drifted: look again with a fresh one
-            continue
+            if not fresh:  # C may have drifted
+                if not refine_vertex(At, b, gain, cap, C, x, q, table, True):
+                    return FAILED
+                fresh = True
+                continue
+            most = _most_violated(r, gain, cap, gamma, work[0, :N])
+            return OK if max(doubt, work[0, most]) <= DOUBT_TOLERANCE else FAILED
         pivot(C, w, leave)
         for j in range(n):
             x[j] += step * C[j, leave]
         q[leave] = name
         if x[n - 1] > stop_above:
             return STOPPED
-        if x[n - 1] > last_gamma + tolerance:
+        if x[n - 1] > last_gamma + FEASIBILITY_TOLERANCE:
             last_gamma = x[n - 1]
             stalled = 0
         else:
@@ -538,6 +573,7 @@ def refit_after_enforcement(
     cap[point] = threshold
     status = OK
     sides = 0
+    drifted = False
     for k in range(n):
         if q[k] >= 0 and q[k] >> 1 == point and was_free:
             # The row loses its gamma: g' = g - e_n, a change of rank one in G and so in C. Not so where both sides
@@ -557,7 +593,8 @@ def refit_after_enforcement(
             gap = (1.0 - 2.0 * (q[k] & 1)) * r[point] - threshold
             for j in range(n):
                 x[j] += gap * C[j, k]
-    if sides == 1 and status == OK and not refine_vertex(At, b, gain, cap, C, x, q, table, False):
+            drifted = multiplier > 0.9  # and so C grew tenfold, rounding with it
+    if sides == 1 and status == OK and not refine_vertex(At, b, gain, cap, C, x, q, table, drifted):
         status = FAILED
     if status == OK:
         status = dual_simplex(At, b, gain, cap, C, x, q, r, work, table, np.inf, False)

@@ -58,11 +58,12 @@ def linear_rows(problem: LinearProblem) -> LinearRows:
     """Return the whitened rows of `problem`; made once, and kept for as long as the problem lives."""
     rows = _known.get(problem)
     if rows is None:
-        rows = _known[problem] = _whiten(problem.A, problem.b)
+        rows = _known[problem] = whiten(problem.A, problem.b)
     return rows
 
 
-def _whiten(A: NDArray[np.float64], b: NDArray[np.float64]) -> LinearRows:
+def whiten(A: NDArray[np.float64], b: NDArray[np.float64]) -> LinearRows:
+    """Return the whitened rows of A, shape (N, d), and b, shape (N,); any N >= 1."""
     n_points, n_params = A.shape
     sizes = np.abs(A).max(axis=0)  # powers of two: scaling by them is exact
     sizes = np.where(sizes > 0, np.exp2(np.round(np.log2(np.where(sizes > 0, sizes, 1.0)))), 1.0)

@@ -23,7 +23,8 @@ FREE_TOLERANCE = 1e-11
 #: A multiplier (they sum to 1) may be this far below 0: Harris' ratio test trades it for a larger pivot.
 DUAL_TOLERANCE = 1e-12
 
-#: The smallest pivot; a row that would need a smaller one is treated as parallel to the basis.
+#: The smallest pivot, relative to the largest coefficient of the row (its rounding grows with that); a row that would
+#: need a smaller one is treated as parallel to the basis.
 PIVOT_TOLERANCE = 1e-10
 
 
@@ -69,16 +70,17 @@ def leaving_row(C: NDArray[np.float64], q: NDArray[np.int64], w: NDArray[np.floa
         return leave
 
     slack = 0.0 if bland else DUAL_TOLERANCE
+    least = PIVOT_TOLERANCE * (1.0 + largest)
     bound = np.inf
     for k in range(n):
-        if w[k] > PIVOT_TOLERANCE and (q[k] >= 0 or q[k] == -n):
+        if w[k] > least and (q[k] >= 0 or q[k] == -n):
             bound = min(bound, (max(C[n - 1, k], 0.0) + slack) / w[k])
     if bound == np.inf:
         return -1
     best = 0.0
     name = np.int64(0)
     for k in range(n):
-        if w[k] > PIVOT_TOLERANCE and (q[k] >= 0 or q[k] == -n) and max(C[n - 1, k], 0.0) <= bound * w[k]:
+        if w[k] > least and (q[k] >= 0 or q[k] == -n) and max(C[n - 1, k], 0.0) <= bound * w[k]:
             if bland:
                 if leave < 0 or q[k] < name:
                     leave = k

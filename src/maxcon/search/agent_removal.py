@@ -13,6 +13,7 @@ from maxcon.agent.shipped import shipped_agent
 from maxcon.minimax import Workspace, allocate
 from maxcon.minimax.jit import kernel
 from maxcon.minimax.linear import OK, basis_multipliers, basis_points, cold_fit, refit_after_removal
+from maxcon.problem.validate import check_number
 from maxcon.search.anytime import Step, Task
 from maxcon.tree.encoding import encode_channels
 
@@ -39,9 +40,9 @@ def agent_removal(
     ValueError
         If there is no agent for the family, or a number is out of its range.
     """
-    if tries < 1:
-        raise ValueError(f"tries must be at least 1, but it is {tries}")
-    if not temperature > 0:
+    if isinstance(tries, bool) or not isinstance(tries, (int, np.integer)) or tries < 1:
+        raise ValueError(f"tries must be a positive integer, but it is {tries!r}")
+    if not check_number(temperature, "temperature") > 0:
         raise ValueError(f"temperature must be positive, but it is {temperature}")
     agent = shipped_agent(task.problem) if weights is None else Agent.load(Path(weights))
     scratch = agent.prepare(task.problem)
