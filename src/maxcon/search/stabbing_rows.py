@@ -1,19 +1,22 @@
 """Rows of a linear problem as strips, the form in which exact stabbing takes them.
 
-Of the r <= 3 independent columns of A one is singled out, the stabbing column c; its parameter is t. Divided by c_i,
-point i is an inlier where ``|x_i . s + t - y_i| <= l_i``, with k = r - 1 parameters s: a strip of the (s, t) space. Points
-with c_i = 0 are strips too, but do not depend on t: *flat* ones. A point whose row is 0 is an inlier always or never.
+Of the r <= 3 independent columns of A one is singled out, the stabbing column c; its parameter is t. Divided by
+c_i, point i is an inlier where ``|x_i . s + t - y_i| <= l_i``, with k = r - 1 parameters s: a strip of the (s, t)
+space. Points with c_i = 0 are strips too, but do not depend on t: *flat* ones. A point whose row is 0 is an
+inlier always or never.
 
-An exact change of parameters makes the numbers tame: x is centred at a median, t moves to a model that was sampled
-(and that is the first incumbent), s is counted from that model, too, in powers of two, and of two correlated
-columns one loses its regression on the other. Parameters without bounds become homogeneous: for a model (s, t) take
-(sigma, w, tau) = w (s, t, 1), scaled such that the largest of |sigma_j| and w is 1. So every strip is
-``w low_i <= a_i . sigma + tau <= w high_i`` over the faces of a cube, w = 0 standing for "infinitely steep".
+A change of parameters makes the numbers tame: x is centred at a median; s and t are counted from a model that
+was sampled, which is the first incumbent, and s in units that are powers of two; of two correlated columns one
+loses its regression on the other. And parameters without bounds become homogeneous: a model (s, t) is any
+positive multiple (sigma, tau, w) of (s, t, 1), and the one is taken at which the largest of |sigma_j| and w is 1. So
+point i is an inlier where ``w low_i <= a_i . sigma + tau <= w high_i``, and (sigma, w) is on the faces of a
+cube; w = 0 stands for "infinitely steep".
 
 What rounding does. Every number is computed from the floats of A and b, one point at a time, by a handful of
-operations, each of which is off by at most u = 2^-53 times its result. `pad` is 2^-48 = 32 u times the sum of
-the sizes of all that is added on the way to an edge, and |sigma_j|, w <= 1: so an edge moved out by `pad` is
-outside of where exact arithmetic would put it. As equal rows are treated alike, duplicates stay duplicates.
+operations, each of which is off by at most u = 2^-53 times its result. `grain` and `pad` are 2^-48 = 32 u times the
+sum of the sizes of all that is added on the way to a_i, and to low_i and high_i. As |sigma_j| <= 1, an edge that
+is moved out by ``grain + w pad`` is outside of where exact arithmetic would put it, its own evaluation
+included. All of this depends on the point alone, so that duplicates stay duplicates.
 """
 
 from __future__ import annotations
@@ -28,25 +31,27 @@ from maxcon.minimax.jit import kernel
 #: 32 units of rounding; the longest chain of operations from the data to an edge has about 20.
 ROUNDING = 2.0**-48
 
-#: Rows with larger (or thresholds with smaller) numbers than this, after division by c_i, are left out of the search
-#: and counted as inliers of everything in the bound.
+#: Rows with larger (or thresholds with smaller) numbers than this after the division by c_i are left out of the
+#: search, and counted as inliers of everything in the bound.
 EXTREME = 1e100
 
 #: How many minimal samples are tried for the first incumbent, on at most three times as many points.
 SAMPLES = 64
 
+#: A sampled model whose values are so many times as large as the data is not used.
+STEEP = 16.0
+
 
 class Strips(NamedTuple):
-    """The strips ``w low <= a0 sigma_0 + a1 sigma_1 + tau <= w high``; the last ones are flat (no tau).
+    """The strips ``w low <= a0 sigma_0 + a1 sigma_1 + tau <= w high``; the last ones are flat: no tau.
 
     Attributes
     ----------
     a0, a1, low, high
         Shape (n,) each; a1 = 0 where k = 1.
-    pad
-        Shape (n,): how far rounding can have moved an edge, anywhere on the cube.
-    grain
-        Shape (n,): the same for a_i alone: rows that differ by no more are equal.
+    pad, grain
+        Shape (n,) each: rounding can have moved an edge by ``grain + w pad``, by `grain` because of a_i. Rows that
+        differ by no more than their grain are equal.
     marks
         Shape (n,), uint64: bit j says that the strip belongs to group j of dependent rows, which has been solved.
     n_regular
@@ -67,8 +72,8 @@ class Strips(NamedTuple):
 def stabbing_column(A: NDArray[np.float64], columns: NDArray[np.int64]) -> tuple[int, bool]:
     """Return which of `columns` to stab along, as a place in `columns`, and whether it is constant.
 
-    A constant one if there is one; else the one with the fewest entries that are small or 0, since dividing by those
-    makes wide strips, which bound poorly.
+    A constant one if there is one; else the one with the fewest entries that are small or 0, since dividing by
+    those makes wide strips, which bound poorly.
     """
     N = A.shape[0]
     best = 0
@@ -94,20 +99,21 @@ def stabbing_column(A: NDArray[np.float64], columns: NDArray[np.int64]) -> tuple
 @kernel
 def _power_of_two(x: float) -> float:
     """Return the power of two nearest to x > 0, within 2^-200 to 2^200."""
-    return float(2.0 ** min(max(np.round(np.log2(x)), -200.0), 200.0))
+    exponent = float(np.round(np.log2(x)))
+    return float(2.0 ** min(max(exponent, -200.0), 200.0))
 
 
 @kernel
-def _middle(values: NDArray[np.float64], n: int) -> float:
-    """Return the median of the first n entries (it sorts them)."""
-    for j in range(1, n):
+def _middle(values: NDArray[np.float64]) -> float:
+    """Return the median of the entries (it sorts them)."""
+    for j in range(1, values.shape[0]):
         value = values[j]
         k = j
         while k > 0 and values[k - 1] > value:
             values[k] = values[k - 1]
             k -= 1
         values[k] = value
-    return values[n // 2]
+    return float(values[values.shape[0] // 2])
 
 
 @kernel
@@ -122,11 +128,7 @@ def _divide(
     reach: NDArray[np.float64],
     order: NDArray[np.int64],
 ) -> tuple[int, int, int, int]:
-    """Write x, y, l (`reach`) and the point of each strip (`order`).
-
-    Returns the number of regular strips, of strips, of points that are always inliers (their indices are at the end
-    of `order`), and of points left out because their numbers are extreme.
-    """
+    """Write x, y, l (`reach`) and the point of each strip (`order`); return what `make_strips` returns."""
     N = A.shape[0]
     k = columns.shape[0] - 1
     scale = np.ones(3)
@@ -179,11 +181,11 @@ def _centre(
     draws: NDArray[np.float64],
     size: NDArray[np.float64],
 ) -> None:
-    """Centre the regular part of a column at a sampled median; write the sizes of what was rounded into `size`."""
+    """Centre the regular part of a column at a sampled median; write the sizes of what was rounded to `size`."""
     values = np.empty(SAMPLES)
     for q in range(SAMPLES):
         values[q] = row[int(draws[q, 0] * n_regular)]
-    centre = _middle(values, SAMPLES)
+    centre = _middle(values)
     for i in range(row.shape[0]):
         size[i] = abs(row[i])
         if i < n_regular:
@@ -195,7 +197,7 @@ def _centre(
 def _decorrelate(
     x: NDArray[np.float64], n: int, n_regular: int, draws: NDArray[np.float64], size: NDArray[np.float64]
 ) -> None:
-    """Subtract a multiple of column 1 from column 0 where they are correlated: a narrow valley makes many boxes.
+    """Subtract a multiple of column 1 from column 0 where they correlate: narrow valleys make many boxes.
 
     The factor has 8 bits, so that data on a grid stay on a grid.
     """
@@ -229,11 +231,18 @@ def _sample_model(
     """Write the best (s_0, s_1, t) of some minimal samples of regular strips into `model`."""
     tested = min(n_regular, 3 * SAMPLES)
     x0, x1, yt, lt = np.empty(tested), np.empty(tested), np.empty(tested), np.empty(tested)
+    width0 = width1 = height = 0.0
     for e in range(tested):
         i = e if tested == n_regular else int(draws[e // 3, e % 3] * n_regular)
         x0[e], x1[e], yt[e], lt[e] = x[0, i], x[1, i], y[i], reach[i]
+        width0 = max(width0, abs(x0[e]))
+        width1 = max(width1, abs(x1[e]))
+        height = max(height, abs(yt[e]), lt[e])
+    values = np.empty(SAMPLES)
+    for q in range(SAMPLES):
+        values[q] = y[int(draws[q, 0] * n_regular)]
     model[0] = model[1] = 0.0
-    model[2] = y[int(draws[0, 0] * n_regular)]
+    model[2] = _middle(values)
     best = 0
     for q in range(SAMPLES):
         i = int(draws[q, 0] * n_regular)
@@ -244,11 +253,13 @@ def _sample_model(
         if k == 1:
             q0, q1, qy = 0.0, 1.0, 0.0
         run = p0 * q1 - p1 * q0
+        if run == 0.0:
+            continue
         s0 = (py * q1 - p1 * qy) / run
         s1 = (p0 * qy - py * q0) / run
         t = y[i] - s0 * x[0, i] - s1 * x[1, i]
-        if run == 0.0 or not (abs(s0) + abs(s1) + abs(t) < EXTREME):
-            continue
+        if not (abs(s0) * width0 + abs(s1) * width1 + abs(t) <= STEEP * height):
+            continue  # of a singular sample, or nearly so: moving to it would amplify rounding
         count = 0
         for e in range(tested):
             count += abs(yt[e] - s0 * x0[e] - s1 * x1[e] - t) <= lt[e]
@@ -259,11 +270,11 @@ def _sample_model(
 
 @kernel
 def _unit(row: NDArray[np.float64], n_regular: int, height: float, draws: NDArray[np.float64]) -> float:
-    """Return the power of two in which a parameter is counted: a change by 1 moves most edges by about `height`."""
+    """Return the unit of a parameter: a power of two, a change by which moves most edges by about `height`."""
     values = np.empty(SAMPLES)
     for q in range(SAMPLES):
         values[q] = abs(row[int(draws[q, 1] * n_regular)])
-    spread = _middle(values, SAMPLES)
+    spread = _middle(values)
     if spread == 0.0:
         for i in range(row.shape[0]):
             spread = max(spread, abs(row[i]))
@@ -281,14 +292,14 @@ def make_strips(
     strips: Strips,
     order: NDArray[np.int64],
 ) -> tuple[int, int, int, int]:
-    """Fill `strips` (arrays of length N) and `order`; the sampled model becomes (sigma, w, tau) = (0, 0, 1, 0).
+    """Fill `strips` (arrays of length N) and `order`; the sampled model becomes sigma = 0, w = 1, tau = 0.
 
     Parameters
     ----------
     A, b, limit
         The data, shapes (N, d) and (N,), and the largest residual of an inlier.
     columns
-        The r = 2 or 3 independent columns of A, the stabbing column last.
+        The r <= 3 independent columns of A, the stabbing column last.
     constant
         Whether that one is constant.
     draws
@@ -315,7 +326,6 @@ def make_strips(
         _sample_model(x, y, reach, k, n_regular, draws, model)
 
     pad, grain = strips.pad, strips.grain
-    values = np.empty(SAMPLES)
     for i in range(n):
         offset = model[2] if i < n_regular else 0.0
         pad[i] = abs(y[i]) + abs(offset) + reach[i]
@@ -325,10 +335,11 @@ def make_strips(
             pad[i] += (abs(x[j, i]) + size[j, i]) * abs(model[j])
     unit0 = unit1 = 1.0
     if n_regular > 0:
+        values = np.empty(SAMPLES)
         for q in range(SAMPLES):
             i = int(draws[q, 2] * n_regular)
             values[q] = max(abs(y[i]), 2.0 * reach[i])
-        height = _middle(values, SAMPLES)
+        height = _middle(values)
         unit0 = _unit(x[0, :n], n_regular, height, draws)
         unit1 = _unit(x[1, :n], n_regular, height, draws)
     for i in range(n):
@@ -337,6 +348,45 @@ def make_strips(
         strips.low[i] = y[i] - reach[i]
         strips.high[i] = y[i] + reach[i]
         grain[i] = ROUNDING * (size[0, i] * unit0 + size[1, i] * unit1)
-        pad[i] = ROUNDING * (pad[i] + abs(y[i]) + abs(strips.a0[i]) + abs(strips.a1[i])) + grain[i]
+        pad[i] = ROUNDING * (pad[i] + abs(y[i]))
         strips.marks[i] = 0
     return n_regular, n, always, left_out
+
+
+@kernel
+def dependent_rows(strips: Strips, members: NDArray[np.int32], k: int) -> tuple[bool, float, float]:
+    """Whether the rows (a_i, 1), or (a_i, 0) where flat, of `members` have rank k or less; k = 1 or 2.
+
+    Up to their rounding. Where so, k = 1 means that all a_i are equal, and k = 2 that they differ along one
+    direction v only; v follows, its larger component 1.
+    """
+    a0, a1, grain = strips.a0, strips.a1, strips.grain
+    here = members[0]
+    far = -1
+    distance = 0.0
+    v0, v1 = 1.0, 0.0
+    for i in members:
+        d0, d1 = a0[i], a1[i]
+        if i < strips.n_regular:
+            d0, d1 = d0 - a0[here], d1 - a1[here]
+            if max(abs(d0), abs(d1)) <= 4.0 * (grain[i] + grain[here]):
+                continue
+        if k == 1:
+            return False, 1.0, 0.0
+        if max(abs(d0), abs(d1)) > distance:
+            far = i
+            distance = max(abs(d0), abs(d1))
+            v0, v1 = d0, d1
+    if far < 0:
+        return True, 1.0, 0.0
+    larger = v0 if abs(v0) >= abs(v1) else v1
+    v0, v1 = v0 / larger, v1 / larger
+    error = 4.0 * (grain[here] + grain[far]) / distance
+    for i in members:
+        d0, d1 = a0[i], a1[i]
+        if i < strips.n_regular:
+            d0, d1 = d0 - a0[here], d1 - a1[here]
+        tolerance = 4.0 * (grain[i] + grain[here]) + error * max(abs(d0), abs(d1))
+        if abs(d0 * v1 - d1 * v0) > tolerance:
+            return False, v0, v1
+    return True, v0, v1
