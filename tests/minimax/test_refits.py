@@ -256,6 +256,8 @@ def test_infeasible_is_only_said_of_enforced_points():
         for i in np.argsort(A[:, -2])[: N - 1]:
             if walk.remove(int(i)) != OK:
                 break
+            w = walk.workspace
+            assert np.abs(w.r[walk.free]).max() <= w.x[-1] + 1e-13 * (1 + np.abs(w.x).sum())  # as OK means
         assert walk.status != INFEASIBLE
 
 

@@ -6,6 +6,7 @@ import math
 import numpy as np
 import pytest
 
+import maxcon
 import oracles
 from maxcon.problem import Consensus, check_indices, check_model, check_threshold, inlier_slack
 from maxcon.problem.validate import check_array, check_number
@@ -169,3 +170,14 @@ def test_result_is_frozen_and_says_what_it_is():
     assert repr(result) == "Consensus(2 of 3 points within 0.25, bounded, gap 1, method 'greedy', 1.50 ms)"
     with pytest.raises(dataclasses.FrozenInstanceError):
         result.n_inliers = 3
+
+
+def test_what_only_looks_like_numbers_is_refused():
+    with pytest.raises(TypeError, match="x must hold real numbers"):
+        maxcon.line(np.array(["2020-01-01", "2020-01-02", "2020-01-03"], dtype="datetime64[D]"), [1, 2, 3])
+    with pytest.raises(TypeError, match="y must hold real numbers"):
+        maxcon.line([1, 2, 3], [1, 2, 10**400])
+    with pytest.raises(ValueError, match="y must have no masked entries"):
+        maxcon.line([1, 2, 3], np.ma.masked_array([1.0, 2.0, 3.0], [False, True, False]))
+    with pytest.raises(TypeError, match="threshold must be a number"):
+        maxcon.fit(maxcon.line([1, 2, 3], [1, 2, 4]), 10**400)

@@ -49,7 +49,7 @@ def kernel(function: F) -> F:
     """
     dispatcher = numba.njit(cache=True, nogil=True, error_model="numpy")(function)
     cache_file = getattr(getattr(dispatcher, "_cache", None), "_cache_file", None)
-    if cache_file is not None:
+    if cache_file is not None and function.__module__.startswith("maxcon."):
         cache_file._source_stamp = _digest(function.__module__.removeprefix("maxcon."))
     return cast(F, dispatcher)
 

@@ -23,12 +23,14 @@ def check_array(value: ArrayLike, name: str, ndim: int) -> NDArray[np.float64]:
         raw = np.asarray(value)
     except ValueError as error:  # ragged nested lists
         raise ValueError(f"{name} must be a regular array of numbers: {error}") from None
-    if raw.dtype.kind == "c":
+    if np.ma.is_masked(value):
+        raise ValueError(f"{name} must have no masked entries; leave these points out")
+    if raw.dtype.kind in "cmM":
         raise TypeError(f"{name} must hold real numbers, but its dtype is {raw.dtype}")
     if raw.dtype.kind not in "biuf":
         try:
             raw = raw.astype(np.float64)
-        except (TypeError, ValueError):
+        except (TypeError, ValueError, OverflowError):
             raise TypeError(f"{name} must hold real numbers, but its dtype is {raw.dtype}") from None
     if raw.ndim != ndim:
         raise ValueError(f"{name} must have {ndim} dimension{'s' * (ndim > 1)}, but its shape is {raw.shape}")
@@ -54,7 +56,7 @@ def check_number(value: Any, name: str) -> float:
         raise TypeError(f"{name} must be a number, but it is {value!r}")
     try:
         return float(value)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         raise TypeError(f"{name} must be a number, but it is {value!r}") from None
 
 

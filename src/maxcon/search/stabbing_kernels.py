@@ -18,7 +18,6 @@ from maxcon.minimax.jit import kernel
 from maxcon.search.stabbing_prism import (
     BOX_SIZE,
     DOUBT,
-    HALF,
     Prism,
     bound_prism,
     split_axis,
@@ -57,8 +56,7 @@ PROVEN = 0
 TIRED = 1  #          the budget is spent
 NODES_FULL = 2  #     more memory for nodes, please, or NODES_CAPPED
 LISTS_FULL = 3  #     more memory for lists, please, or LISTS_CAPPED
-DEPENDENT = 4  #      the node's points have dependent rows: a problem with a parameter less
-UNDECIDED = 5  #      the node's points had better be judged by the engine
+UNDECIDED = 4  #      the node's points had better be judged by the engine
 
 
 class Tree(NamedTuple):
@@ -212,17 +210,6 @@ def _room_for_lists(tree: Tree, n: int) -> bool:
 
 
 @kernel
-def _solved(strips: Strips, members: NDArray[np.int32]) -> bool:
-    """Whether all these points belong to one group of dependent rows that has been solved."""
-    common = strips.marks[members[0]]
-    for i in members:
-        common &= strips.marks[i]
-        if common == 0:
-            return False
-    return True
-
-
-@kernel
 def _split(strips: Strips, prism: Prism, tree: Tree, node: int, axis: int, listed: bool) -> None:
     """Halve the prism of a node; open the halves that may hold something better."""
     for side in range(2):
@@ -246,7 +233,9 @@ def _plant(strips: Strips, prism: Prism, tree: Tree, root: NDArray[np.float64]) 
 
 
 @kernel
-def advance(strips: Strips, prism: Prism, tree: Tree, roots: NDArray[np.float64], k: int, budget: int, gap: int) -> int:
+def advance(
+    strips: Strips, prism: Prism, tree: Tree, roots: NDArray[np.float64], dependence: int, budget: int, gap: int
+) -> int:
     """Search until `budget` units of work are spent, or there is a reason to come back; return it.
 
     Parameters
@@ -259,8 +248,8 @@ def advance(strips: Strips, prism: Prism, tree: Tree, roots: NDArray[np.float64]
         The state of the search. A node that the last call asked about (``state[NODE]``) is closed.
     roots
         Shape (faces, 8): the boxes and windows to begin with.
-    k
-        How many outer parameters there are, 1 or 2.
+    dependence
+        Prisms all of whose possible inliers have a rank of no more than this are dropped.
     budget, gap
         How much work to do, and which gap is small enough. A unit is one point in one prism.
     """
@@ -277,15 +266,11 @@ def advance(strips: Strips, prism: Prism, tree: Tree, roots: NDArray[np.float64]
         node = _take(tree, prism.best[0], gap)
         if node < 0:
             return PROVEN
+        points = node_points(tree, node)
+        if dependence > 0 and tree.base[node] == 0 and dependent_rows(strips, points, dependence):
+            _release(tree, node)
+            continue
         box = tree.boxes[node]
-        if box[HALF + 2] > 0.0 and tree.base[node] == 0:  # steep, and the list holds all that is possible
-            points = node_points(tree, node)
-            if _solved(strips, points):
-                _release(tree, node)
-                continue
-            if dependent_rows(strips, points, k)[0]:
-                state[NODE] = node
-                return DEPENDENT
         axis = split_axis(box)
         if axis < 0 or box[DOUBT] >= PATIENCE:
             state[NODE] = node
@@ -293,7 +278,7 @@ def advance(strips: Strips, prism: Prism, tree: Tree, roots: NDArray[np.float64]
         if state[NODES_CAPPED] == 0 and state[USED] + 2 > tree.bound.shape[0] - RESERVE and state[FREE] < 0:
             _put_back(tree, node)
             return NODES_FULL
-        n = node_points(tree, node).shape[0]
+        n = points.shape[0]
         listed = _room_for_lists(tree, n)
         if not listed and state[LISTS_CAPPED] == 0:
             _put_back(tree, node)

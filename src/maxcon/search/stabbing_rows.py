@@ -52,8 +52,6 @@ class Strips(NamedTuple):
     pad, grain
         Shape (n,) each: rounding can have moved an edge by ``grain + w pad``, by `grain` because of a_i. Rows that
         differ by no more than their grain are equal.
-    marks
-        Shape (n,), uint64: bit j says that the strip belongs to group j of dependent rows, which has been solved.
     n_regular
         How many are not flat; these come first.
     """
@@ -64,7 +62,6 @@ class Strips(NamedTuple):
     high: NDArray[np.float64]
     pad: NDArray[np.float64]
     grain: NDArray[np.float64]
-    marks: NDArray[np.uint64]
     n_regular: int
 
 
@@ -289,10 +286,10 @@ def make_strips(
     columns: NDArray[np.int64],
     constant: bool,
     draws: NDArray[np.float64],
-    strips: Strips,
+    fields: NDArray[np.float64],
     order: NDArray[np.int64],
 ) -> tuple[int, int, int, int]:
-    """Fill `strips` (arrays of length N) and `order`; the sampled model becomes sigma = 0, w = 1, tau = 0.
+    """Fill `fields` and `order`; the sampled model becomes sigma = 0, w = 1, tau = 0.
 
     Parameters
     ----------
@@ -304,8 +301,10 @@ def make_strips(
         Whether that one is constant.
     draws
         Shape (SAMPLES, 3): random numbers in [0, 1).
-    strips, order
-        Output; `order` holds the point of each strip.
+    fields
+        Output, shape (6, N): the arrays of `Strips`, in their order, as long as there are strips.
+    order
+        Output, shape (N,): the point of each strip.
 
     Returns
     -------
@@ -325,7 +324,7 @@ def make_strips(
             _decorrelate(x, n, n_regular, draws, size[0])
         _sample_model(x, y, reach, k, n_regular, draws, model)
 
-    pad, grain = strips.pad, strips.grain
+    a0, a1, low, high, pad, grain = fields[0], fields[1], fields[2], fields[3], fields[4], fields[5]
     for i in range(n):
         offset = model[2] if i < n_regular else 0.0
         pad[i] = abs(y[i]) + abs(offset) + reach[i]
@@ -343,50 +342,49 @@ def make_strips(
         unit0 = _unit(x[0, :n], n_regular, height, draws)
         unit1 = _unit(x[1, :n], n_regular, height, draws)
     for i in range(n):
-        strips.a0[i] = x[0, i] * unit0
-        strips.a1[i] = x[1, i] * unit1
-        strips.low[i] = y[i] - reach[i]
-        strips.high[i] = y[i] + reach[i]
+        a0[i] = x[0, i] * unit0
+        a1[i] = x[1, i] * unit1
+        low[i] = y[i] - reach[i]
+        high[i] = y[i] + reach[i]
         grain[i] = ROUNDING * (size[0, i] * unit0 + size[1, i] * unit1)
         pad[i] = ROUNDING * (pad[i] + abs(y[i]))
-        strips.marks[i] = 0
     return n_regular, n, always, left_out
 
 
 @kernel
-def dependent_rows(strips: Strips, members: NDArray[np.int32], k: int) -> tuple[bool, float, float]:
-    """Whether the rows (a_i, 1), or (a_i, 0) where flat, of `members` have rank k or less; k = 1 or 2.
+def dependent_rows(strips: Strips, members: NDArray[np.int32], k: int) -> bool:
+    """Whether the rows (a_i, 1), or (a_i, 0) where flat, of `members` (regular ones first) have rank k or less.
 
-    Up to their rounding. Where so, k = 1 means that all a_i are equal, and k = 2 that they differ along one
-    direction v only; v follows, its larger component 1.
+    Up to their rounding; k = 1 or 2.
     """
     a0, a1, grain = strips.a0, strips.a1, strips.grain
     here = members[0]
+    if here >= strips.n_regular:
+        return True
     far = -1
     distance = 0.0
     v0, v1 = 1.0, 0.0
-    for i in members:
+    for i in members:  # how far do the a_i go from the first one?
         d0, d1 = a0[i], a1[i]
         if i < strips.n_regular:
             d0, d1 = d0 - a0[here], d1 - a1[here]
             if max(abs(d0), abs(d1)) <= 4.0 * (grain[i] + grain[here]):
                 continue
         if k == 1:
-            return False, 1.0, 0.0
+            return False
         if max(abs(d0), abs(d1)) > distance:
             far = i
             distance = max(abs(d0), abs(d1))
             v0, v1 = d0, d1
     if far < 0:
-        return True, 1.0, 0.0
-    larger = v0 if abs(v0) >= abs(v1) else v1
-    v0, v1 = v0 / larger, v1 / larger
+        return True
+    v0, v1 = v0 / distance, v1 / distance
     error = 4.0 * (grain[here] + grain[far]) / distance
-    for i in members:
+    for i in members:  # and do all go in that direction?
         d0, d1 = a0[i], a1[i]
         if i < strips.n_regular:
             d0, d1 = d0 - a0[here], d1 - a1[here]
         tolerance = 4.0 * (grain[i] + grain[here]) + error * max(abs(d0), abs(d1))
         if abs(d0 * v1 - d1 * v0) > tolerance:
-            return False, v0, v1
-    return True, v0, v1
+            return False
+    return True
