@@ -11,6 +11,7 @@ import maxcon.fitting
 from instances import FAMILIES
 from maxcon.datasets.synthetic import synthetic_hyperplane
 from maxcon.search.anytime import Progress, Step, make_task, run
+from maxcon.search.conclusion import conclude
 from oracles import default_slack, highs_minimax
 
 METHODS = tuple(maxcon.methods())
@@ -143,7 +144,7 @@ def test_the_result_is_frozen(problem):
         ({"gap": -1}, ValueError, "gap must be at least 0"),
         ({"gap": 0.5}, TypeError, "gap must be a whole number"),
         ({"callback": 3}, TypeError, "callback must be callable"),
-        ({"method": "greedy", "tries": 3}, TypeError, "unknown option 'tries' for method 'greedy'"),
+        ({"method": "greedy", "tries": 3}, TypeError, "unknown option 'tries' for method greedy: "),
         ({"method": "random", "tries": 0}, ValueError, "tries must be a positive integer"),
         ({"method": "agent", "temperature": 0}, ValueError, "temperature must be positive"),
         ({"method": "agent", "weights": "nowhere.safetensors"}, ValueError, "weights must name an agent file"),
@@ -204,3 +205,20 @@ def test_the_loop_stops_at_the_deadline_and_on_ctrl_c(problem):
 def test_stopped_before_the_first_step_there_is_still_a_model(problem):
     result = maxcon.fit(problem, 0.1, method="random", time_limit=1e-9)
     check(result, problem, 0.1)
+
+
+def test_a_bound_that_is_refuted_proves_nothing(problem):
+    task = make_task(problem, 0.1, np.random.default_rng(0))
+    found = maxcon.fit(problem, 0.1).inlier_mask
+    best = run(task, iter([Step(subset=found, upper_bound=int(found.sum()) - 1)]))
+    result = conclude(task, best, "liar", None, 0.0)
+    assert result.status == "heuristic"
+    assert result.upper_bound == problem.n_points
+
+
+def test_a_long_walk_of_the_agent_can_be_stopped():
+    problem = synthetic_hyperplane(np.random.default_rng(0), 2000, 0.5, 2)
+    seen = []
+    result = maxcon.fit(problem, 0.1, method="agent", time_limit=0.05, callback=seen.append)
+    check(result, problem, 0.1)
+    assert not seen  # the walk had not ended

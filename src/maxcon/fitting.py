@@ -5,7 +5,7 @@ from __future__ import annotations
 import inspect
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib import import_module
 from typing import Any
 
@@ -143,11 +143,12 @@ def fit(
     refiner = _check_refine(refine)
     name = choose_method(problem) if method == "auto" else _check_method(method)
     function = METHODS[name].load()
-    _check_options(name, function, options)
+    _check_options(name if method != "auto" else f"{name} (chosen by auto)", function, options)
 
     task = make_task(problem, threshold, generator, time_limit, int(gap))
     best = run(task, function(task, **options), refiner, callback)
-    return conclude(task, best, name, seed, time.perf_counter() - began)
+    result = conclude(task, best, name, seed, 0.0)
+    return replace(result, seconds=time.perf_counter() - began)
 
 
 def methods() -> dict[str, str]:
@@ -201,5 +202,5 @@ def _check_options(name: str, function: Method, options: dict[str, Any]) -> None
     known = list(inspect.signature(function).parameters)[1:]
     for option in options:
         if option not in known:
-            has = f"its options are {', '.join(known)}" if known else "it has none"
-            raise TypeError(f"unknown option {option!r} for method {name!r}: {has}")
+            has = f"its options are {', '.join(known)}" if known else "this method takes no options"
+            raise TypeError(f"unknown option {option!r} for method {name}: {has}")

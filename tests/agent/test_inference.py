@@ -182,3 +182,17 @@ def test_graph_against_the_obvious():
     small = neighbour_graph(H[:3], 6)
     assert small.shape == (3, 6)
     assert np.array_equal(small[:, 3:], np.arange(3)[:, None].repeat(3, axis=1))
+
+
+def test_shipped_agents_are_what_their_command_makes():
+    """The settings in the file are those of `maxcon train`, and what they were trained to see has not changed since."""
+    expected = {"line": [-3.037, -3.0312, -3.0351], "plane": [-3.098, -3.1059, -3.1099, -3.0881]}
+    for name, n_params in (("line", 2), ("plane", 3)):
+        problem = synthetic_hyperplane(np.random.default_rng(1), 100, 0.3, n_params)
+        agent = shipped_agent(problem)
+        assert agent.config == shipped(n_params, agent.config.train.seed)
+        state = root(problem, 0.1)
+        q = np.empty(n_params + 1)
+        channels = np.ascontiguousarray(state.encode(agent.config.network.channels)[:, -5:])
+        q_values(agent.parameters, agent.prepare(problem), channels, state.basis, q)
+        assert np.allclose(q, expected[name], atol=2e-3), q

@@ -197,7 +197,7 @@ def test_many_outliers_are_only_counted(run, tmp_path):
     y = np.where(x < 50, 0.0, np.random.default_rng(0).uniform(1.0, 9.0, 100))
     np.savetxt(tmp_path / "many.csv", np.column_stack([x, y]))
     result = run("fit", "many.csv", "--model", "line", "--threshold", 0.1)
-    assert "50 rows (the JSON file lists them)" in result.stdout
+    assert "50 rows (--json lists them)" in result.stdout
 
 
 def test_equation():

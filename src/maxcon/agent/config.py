@@ -63,7 +63,7 @@ class TrainConfig:
     exploration, final_exploration
         epsilon of the epsilon-greedy policy, falling linearly over the first half of the training.
     reward_scale
-        The reward of a step is minus this; a change of unit that suits Huber's loss.
+        Departure 7: the reward of a step is minus this, not -1, which keeps errors where Huber's loss is quadratic.
     clip
         Largest norm of a gradient, 0 for none.
     n_episodes
@@ -113,11 +113,13 @@ class AgentConfig:
 
     @classmethod
     def from_dict(cls, values: dict[str, Any]) -> AgentConfig:
-        """Return the configuration that `to_dict` made `values` of."""
+        """Return the configuration that `to_dict` made `values` of; ValueError if a setting is missing or unknown."""
 
         def build(kind: type[Any], entries: dict[str, Any]) -> Any:
             known = {each.name for each in fields(kind)}
-            return kind(**{k: tuple(v) if isinstance(v, list) else v for k, v in entries.items() if k in known})
+            if known != set(entries):
+                raise ValueError(f"values must have the settings {sorted(known)}, but they have {sorted(entries)}")
+            return kind(**{k: tuple(v) if isinstance(v, list) else v for k, v in entries.items()})
 
         return cls(build(NetworkConfig, values["network"]), build(TrainConfig, values["train"]))
 

@@ -22,6 +22,8 @@ def neighbour_graph(H: NDArray[np.float32], neighbours: int) -> NDArray[np.int32
     k = min(neighbours, N)
     graph = np.tile(np.arange(N, dtype=np.int32)[:, None], (1, neighbours))
     graph[:, :k] = cKDTree(H).query(H, k=np.arange(1, k + 1))[1]
+    missing = ~(graph == np.arange(N)[:, None]).any(axis=1)  # among more than k equal points
+    graph[missing, 0] = np.flatnonzero(missing)
     return graph
 
 

@@ -20,6 +20,9 @@ from maxcon.problem import LinearProblem
 from maxcon.tree.batch import BatchEnvironment, Instances, make_instances
 from maxcon.tree.encoding import canonical_features, channel_flags, raw_features
 
+#: How often in a row an instance that needs no removal may be drawn: then there is hardly another.
+_MOST_DRAWS = 1000
+
 
 @dataclass(frozen=True, eq=False)
 class TrainingSet:
@@ -66,9 +69,13 @@ class Learner:
     def act(self) -> None:
         """Make an epsilon-greedy step in every episode; a finished one goes on with another instance (lines 3-9)."""
         environment, train = self.environment, self.config.train
-        while environment.done.any():
+        for _ in range(_MOST_DRAWS):
+            if not environment.done.any():
+                break
             finished = np.flatnonzero(environment.done)
             environment.reset(finished, self.rng.integers(0, len(self.data.instances), len(finished)))
+        else:
+            raise ValueError(f"problems must need a removal, but {_MOST_DRAWS} draws in a row found one that does not")
         with torch.no_grad():
             actions = self.q_values(self.network, environment).argmax(dim=1).numpy()
         through = min(1.0, 2.0 * self.updates / train.updates)

@@ -83,10 +83,32 @@ def train(
     ValueError
         If `folder` holds a run with another configuration.
     """
+    threads = torch.get_num_threads()
     torch.set_num_threads(1)
+    try:
+        return _train(config, data, held_out, folder, report_every, checkpoint_seconds, progress)
+    finally:
+        torch.set_num_threads(threads)
+
+
+def _train(
+    config: AgentConfig,
+    data: TrainingSet,
+    held_out: HeldOut,
+    folder: Path,
+    report_every: int,
+    checkpoint_seconds: float,
+    progress: bool,
+) -> Learner:
     folder.mkdir(parents=True, exist_ok=True)
     _claim(folder, config)
     learner = Learner(data, config)
+    held, settings = len(learner.memory.action), config.train
+    if held * settings.n_episodes < 4 * settings.batch or held <= 2 * settings.n_step:
+        raise ValueError(
+            "memory must hold at least 4 batches, and more than 2 * n_step steps of each of the n_episodes episodes, "
+            f"but it is {settings.memory}"
+        )
     if (folder / "checkpoint.pt").exists():
         load_checkpoint(learner, folder / "checkpoint.pt")
     log = _Log(folder, learner.updates)
@@ -152,8 +174,15 @@ def _claim(folder: Path, config: AgentConfig) -> None:
     path = folder / "config.json"
     text = json.dumps(config.to_dict(), indent=2, sort_keys=True)
     if path.exists():
-        if path.read_text(encoding="utf-8") != text:
-            raise ValueError(f"folder holds a run with another configuration ({path}); name a new folder")
+        before = json.loads(path.read_text(encoding="utf-8"))
+        after = json.loads(text)
+        for part in sorted(after):
+            for name, value in after[part].items():
+                if (was := before.get(part, {}).get(name)) != value:
+                    raise ValueError(
+                        f"folder holds a run with another configuration ({path}): its {name} is {was}, not {value}; "
+                        "name a new folder"
+                    )
     else:
         path.write_text(text, encoding="utf-8")
 
@@ -166,9 +195,10 @@ class _Log:
 
         self.path = folder / "log.jsonl"
         if self.path.exists():
-            lines = [line for line in self.path.read_text(encoding="utf-8").splitlines() if line.endswith("}")]
-            kept = [line for line in lines if json.loads(line)["updates"] <= updates]
-            self.path.write_text("".join(line + "\n" for line in kept), encoding="utf-8")
+            lines = self.path.read_text(encoding="utf-8").splitlines()
+            part = self.path.with_suffix(".part")
+            part.write_text("".join(line + "\n" for line in lines if _reported(line) <= updates), encoding="utf-8")
+            os.replace(part, self.path)
         self.board = SummaryWriter(str(folder), purge_step=updates + 1)
         self.began = time.perf_counter()
 
@@ -187,6 +217,14 @@ class _Log:
 
     def close(self) -> None:
         self.board.close()
+
+
+def _reported(line: str) -> float:
+    """Return after how many updates a line was written; infinity for a line that a kill cut short."""
+    try:
+        return float(json.loads(line)["updates"])
+    except (json.JSONDecodeError, KeyError):
+        return float("inf")
 
 
 @contextmanager

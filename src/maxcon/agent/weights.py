@@ -44,4 +44,9 @@ def load_weights(path: Path) -> tuple[dict[str, NDArray[np.float32]], AgentConfi
         raise ValueError(f"weights must be a safetensors file, but {str(path)!r} is not: {error}") from None
     if "config" not in metadata:
         raise ValueError(f"weights must be an agent file of maxcon, but {str(path)!r} holds no configuration")
-    return tensors, AgentConfig.from_dict(json.loads(metadata["config"]))
+    try:
+        return tensors, AgentConfig.from_dict(json.loads(metadata["config"]))
+    except (ValueError, KeyError, TypeError) as error:
+        raise ValueError(
+            f"weights must be an agent file of this version of maxcon, but {str(path)!r}: {error}"
+        ) from None

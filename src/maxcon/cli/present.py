@@ -56,7 +56,7 @@ def consensus_table(consensus: Consensus, names: Sequence[str], refine: str | No
     if 0 < len(outliers) <= LISTED_OUTLIERS:
         table.add_row("outliers", f"row{'s' * (len(outliers) > 1)} {runs_of(outliers)}")
     elif len(outliers) > 0:
-        table.add_row("outliers", f"{len(outliers)} rows (the JSON file lists them)")
+        table.add_row("outliers", f"{len(outliers)} rows (--json lists them)")
     return table
 
 

@@ -41,7 +41,7 @@ class Consensus:
     method
         The name of the method that found it.
     seed
-        What seeded the random numbers, or None where none were drawn or a generator was passed.
+        What seeded the random numbers (drawn or not), or None where a generator was passed.
     seconds
         Wall-clock time of the fit.
     """

@@ -50,17 +50,28 @@ def agent_removal(
     N = task.problem.n_points
     channels = np.empty((N, agent.parameters.n_channels), dtype=np.float32)
     path = np.empty(N, dtype=np.int64)
+    budget = max(1, _POINTS_A_SLICE // N)
     for attempt in range(tries):
         workspace.gain[:] = 1.0
         workspace.cap[:] = 0.0
         noise = task.rng.gumbel(scale=temperature, size=(N, len(workspace.x))) if attempt else _NO_NOISE
-        length = walk(workspace, agent.parameters, scratch, agent.flags, task.limit, noise, channels, path)
-        if length < 0:
-            raise ArithmeticError("a minimax fit did not converge; please report the data that made this happen")
+        length = 0
+        while True:
+            done, length = walk(
+                workspace, agent.parameters, scratch, agent.flags, task.limit, noise, channels, path, length, budget
+            )
+            if length < 0:
+                raise ArithmeticError("a minimax fit did not converge; please report the data that made this happen")
+            if done:
+                break
+            yield Step()
         yield Step(subset=workspace.gain == 1.0, path=path[:length].copy())
 
 
 _NO_NOISE = np.zeros((0, 0))
+
+#: A slice of a walk looks at about so many points, all its states together: some hundredths of a second.
+_POINTS_A_SLICE = 20000
 
 
 @kernel
@@ -73,8 +84,12 @@ def walk(
     noise: NDArray[np.float64],
     channels: NDArray[np.float32],
     path: NDArray[np.int64],
-) -> int:
-    """Walk from the workspace's set to a feasible one; return the number of removals, -1 if a fit failed.
+    length: int,
+    budget: int,
+) -> tuple[bool, int]:
+    """Go on with a walk that has made `length` removals, by at most `budget` more.
+
+    Returns whether a feasible set is reached, and how many removals it took so far; -1 if a fit failed.
 
     ``noise[t]`` is added to the Q-values of step t (Gumbel noise makes the best a draw); of no rows: none.
     """
@@ -83,12 +98,14 @@ def walk(
     basis = np.empty(n, dtype=np.int64)
     multipliers = np.empty(n)
     value = np.empty(n)
-    if cold_fit(At, b, gain, cap, C, x, q, r, work, table) != OK:
-        return -1
-    length = 0
+    if length == 0 and cold_fit(At, b, gain, cap, C, x, q, r, work, table) != OK:
+        return False, -1
+    last = length + budget
     while x[n - 1] > limit:
+        if length == last:
+            return False, length
         if basis_points(C, q, basis) == 0:
-            return -1
+            return False, -1
         basis_multipliers(C, q, basis, multipliers)
         encode_channels(r, x[n - 1], limit, gain, basis, multipliers, flags, channels)
         q_values(parameters, scratch, channels, basis, value)
@@ -100,6 +117,6 @@ def walk(
                 best = slot
         path[length] = basis[best]
         if refit_after_removal(At, b, gain, cap, C, x, q, r, work, table, basis[best]) != OK:
-            return -1
+            return False, -1
         length += 1
-    return length
+    return True, length

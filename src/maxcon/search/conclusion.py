@@ -28,9 +28,10 @@ def conclude(task: Task, best: Best, method: str, seed: int | None, seconds: flo
         fit = minimax_fit(problem, subset)
         mask = problem.residuals(fit.model) <= limit
     n_inliers = int(mask.sum())
-    upper_bound = max(best.upper_bound, n_inliers)
+    # A recount above the bound refutes the bound: then nothing is proven.
+    upper_bound = best.upper_bound if n_inliers <= best.upper_bound else problem.n_points
     status: Status = "heuristic"
-    if upper_bound == n_inliers:
+    if upper_bound == n_inliers:  # also where all points are inliers, which needs no proof
         status = "optimal"
     elif upper_bound < problem.n_points:
         status = "bounded"
@@ -60,7 +61,7 @@ def any_feasible_set(task: Task) -> NDArray[np.bool_] | None:
     if np.abs(rows.b).min() <= limit:  # the least-squares fit of all points explains some
         subset: NDArray[np.bool_] = np.abs(rows.b) <= limit
         return subset
-    movable = np.flatnonzero(np.abs(rows.At).max(axis=0, initial=0.0) > 1e-9)
+    movable = np.flatnonzero(np.abs(task.problem.A).max(axis=1) > 0)
     if len(movable) == 0:  # no parameter moves any residual, and none is within the threshold
         return None
     subset = np.zeros(task.problem.n_points, dtype=np.bool_)

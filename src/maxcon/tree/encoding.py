@@ -35,6 +35,7 @@ def canonical_features(problem: LinearProblem) -> NDArray[np.float32]:
     fit of all points, relative to its largest, which is the same for ``b`` and ``scale * b + A @ anything``.
     """
     columns = _varying_columns(problem.A)
+    columns = columns / np.abs(columns).max(axis=0)
     columns = (columns - columns.mean(axis=0)) / columns.std(axis=0)
     fit = minimax_fit(problem)
     signed = problem.b - problem.A @ fit.model

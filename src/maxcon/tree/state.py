@@ -42,6 +42,10 @@ class State:
     path: tuple[int, ...]
     _workspace: Workspace
 
+    def __repr__(self) -> str:
+        kept = int(self.subset.sum())
+        return f"State({kept} of {len(self.subset)} points, f(S) = {self.value:.4g}, goal {self.is_goal})"
+
     @property
     def is_goal(self) -> bool:
         """Whether f(S) is within the threshold: no more points need to go."""
