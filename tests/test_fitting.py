@@ -61,7 +61,8 @@ def test_every_method_keeps_what_a_consensus_promises(method, n_params):
         check(result, problem, 0.1)
         assert result.method == method
         again = maxcon.fit(problem, 0.1, method=method, refine=refine, time_limit=2)
-        assert np.array_equal(again.inlier_mask, result.inlier_mask)
+        if max(result.seconds, again.seconds) < 1.5:  # not cut short by the time limit
+            assert np.array_equal(again.inlier_mask, result.inlier_mask)
 
 
 @pytest.mark.parametrize("family", FAMILIES)

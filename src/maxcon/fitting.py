@@ -71,6 +71,14 @@ METHODS: dict[str, MethodEntry] = {
     "exact": MethodEntry(
         "maxcon.search.exact:exact", "the proven optimum, d <= 3: branch and bound with interval stabbing"
     ),
+    "astar": MethodEntry("maxcon.search.astar:astar", "the proven optimum: A* tree search (Chin et al. 2015)"),
+    "astar-napa": MethodEntry(
+        "maxcon.search.astar:astar_napa", "A* with non-adjacent path avoidance (Cai et al. 2019)"
+    ),
+    "astar-napa-dibp": MethodEntry(
+        "maxcon.search.astar:astar_napa_dibp", "the same with dimension-insensitive branch pruning (Cai et al. 2019)"
+    ),
+    "milp": MethodEntry("maxcon.search.milp:milp", "the proven optimum by big-M integer programming (HiGHS)"),
 }
 
 REFINERS: dict[str, str] = {

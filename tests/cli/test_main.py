@@ -5,7 +5,7 @@ import pytest
 
 import maxcon
 
-COMMANDS = ("fit", "demo", "methods", "agents", "train", "evaluate")
+COMMANDS = ("fit", "demo", "methods", "agents", "train", "evaluate", "verify")
 
 
 def python(code):

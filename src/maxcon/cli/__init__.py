@@ -12,7 +12,7 @@ import click
 from maxcon import __version__
 
 #: The commands in the order of the help; ``maxcon.cli.NAME`` holds ``command``.
-_COMMANDS = ("fit", "demo", "methods", "agents", "train", "evaluate")
+_COMMANDS = ("fit", "verify", "demo", "methods", "agents", "train", "evaluate")
 
 #: What a shell expects of a program that Ctrl-C ended.
 INTERRUPTED = 130

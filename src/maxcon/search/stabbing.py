@@ -47,8 +47,8 @@ from maxcon.search.stabbing_kernels import (
 from maxcon.search.stabbing_prism import BOX_SIZE, CENTRE, HALF, WINDOW, Prism, inliers
 from maxcon.search.stabbing_rows import SAMPLES, Strips, dependent_rows, make_strips, stabbing_column
 
-#: Points in prisms between two steps: some 10 ms.
-BUDGET = 1_000_000
+#: Points in prisms between two steps: some 5 ms.
+BUDGET = 500_000
 
 #: Memory for nodes, at first and at most: 150 bytes each.
 FIRST_NODES, MOST_NODES = 2_048, 262_144
@@ -59,7 +59,7 @@ FIRST_LISTS, MOST_LISTS = (16, 32_768), (32, 16_777_216)
 #: Bins of one stabbing at most: these stay in the nearest cache.
 MOST_BINS = 4_096
 
-#: How many minimax fits may go into the decision about a box that is too small to be split.
+#: How many minimax fits may go into the decision about a prism that splitting does not decide.
 FITS = 256
 
 #: Points that the engine may refuse in a set that the search has found, before the set is given up.
@@ -98,9 +98,9 @@ def exact_stabbing(task: Task) -> Iterator[Step]:
     Notes
     -----
     The bound holds for all models, whatever their size, and for the floats given: intervals are widened by what
-    rounding can do. Where a box is so small that splitting it is pointless, its points are decided by minimax fits,
-    a bounded number of them; where these do not settle it, the search ends with a gap. Memory is bounded; when it
-    runs out, the search goes depth-first.
+    rounding can do. Where splitting a box further is pointless (rounding is larger than the box, or its points just
+    fail to fit one model, all over it), minimax fits decide, a bounded number of them; where these do not settle it,
+    the search ends with a gap. Memory is bounded; when it runs out, the search goes depth-first.
     """
     rank = task.rows.At.shape[0]
     if rank > 3:
