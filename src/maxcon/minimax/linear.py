@@ -50,7 +50,7 @@ def compute_residuals(
 
 @kernel
 def _subtract_product(At: NDArray[np.float64], x: NDArray[np.float64], r: NDArray[np.float64]) -> None:
-    d, N = At.shape
+    d, N = At.shape[0], r.shape[0]
     j = 0
     while j + 3 < d:  # four directions a pass: memory traffic, not arithmetic, is what costs
         x0, x1, x2, x3 = x[j], x[j + 1], x[j + 2], x[j + 3]
@@ -433,6 +433,13 @@ def cold_fit(
     status = FAILED
     for attempt in range(2):
         start(C, x, q)
+        if attempt == 0 and x.shape[0] > 5 and r.shape[0] >= 40 * x.shape[0]:
+            # The fit of some points is a good start for the fit of all, and its pivots look at those points only;
+            # with few parameters there are too few pivots to save.
+            m = 8 * x.shape[0]
+            early = dual_simplex(At, b[:m], gain[:m], cap[:m], C, x, q, r[:m], work, table, np.inf, False)
+            if early != OK:
+                start(C, x, q)
         status = dual_simplex(At, b, gain, cap, C, x, q, r, work, table, np.inf, attempt > 0)
         if status == OK:
             status = _settle(At, b, gain, cap, C, x, q, r, work, table)
