@@ -61,11 +61,11 @@ def any_feasible_set(task: Task) -> NDArray[np.bool_] | None:
     if np.abs(rows.b).min() <= limit:  # the least-squares fit of all points explains some
         subset: NDArray[np.bool_] = np.abs(rows.b) <= limit
         return subset
-    movable = np.flatnonzero(np.abs(task.problem.A).max(axis=1) > 0)
-    if len(movable) == 0:  # no parameter moves any residual, and none is within the threshold
+    sizes = np.abs(task.problem.A).max(axis=1)
+    if sizes.max() == 0:  # no parameter moves any residual, and none is within the threshold
         return None
     subset = np.zeros(task.problem.n_points, dtype=np.bool_)
-    subset[movable[0]] = True
+    subset[sizes.argmax()] = True
     return subset
 
 
