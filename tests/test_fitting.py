@@ -23,7 +23,7 @@ def problem():
 
 
 def serves(method, problem):
-    largest = {"sweep": 2, "agent": 3, "exact": 3}
+    largest = {"sweep": 2, "agent": 3}
     return problem.n_params <= largest.get(method, 99)
 
 
@@ -133,7 +133,7 @@ def test_the_result_is_frozen(problem):
         ({"threshold": float("nan")}, ValueError, "threshold must be a positive"),
         ({"threshold": float("inf")}, ValueError, "threshold must be a positive"),
         ({"threshold": "1"}, TypeError, "threshold must be a number"),
-        ({"method": "best"}, ValueError, "method must be 'auto' or one of"),
+        ({"method": "best"}, ValueError, "method must be one of auto, "),
         ({"method": 3}, TypeError, "method must be a string"),
         ({"rng": -1}, ValueError, "rng must be a seed"),
         ({"rng": "x"}, TypeError, "rng must be None, a seed"),

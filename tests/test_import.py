@@ -13,7 +13,7 @@ PACKAGE = Path(maxcon.__file__).parent
 HEAVY = ("numba", "torch", "scipy", "matplotlib", "sklearn", "cv2", "gymnasium")
 
 
-CORE = {"problem", "datasets", "minimax", "tree", "agent", "search", "certify", "fitting"}
+CORE = {"problem", "datasets", "minimax", "tree", "agent", "search", "certification", "fitting", "certifying"}
 NEEDS_EXTRAS = {
     "tree/environments.py",
     "tree/registration.py",

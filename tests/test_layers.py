@@ -18,8 +18,9 @@ LAYERS = [
     "tree",
     "agent",
     "search",
-    "certify",
+    "certification",
     "fitting",
+    "certifying",
     "vision",
     "estimators",
     "experiments",
@@ -36,7 +37,7 @@ EXTRAS = {
     "agent/learn.py": {"torch"},
     "agent/train.py": {"torch"},
 }
-CORE = ["problem", "datasets", "minimax", "tree", "agent", "search", "certify", "fitting"]
+CORE = ["problem", "datasets", "minimax", "tree", "agent", "search", "certification", "fitting", "certifying"]
 
 FILES = sorted(path for path in PACKAGE.rglob("*.py") if path != PACKAGE / "__init__.py")
 

@@ -9,11 +9,14 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from maxcon.certifying import certify as certify
+    from maxcon.certifying import write_certificate as write_certificate
     from maxcon.fitting import fit as fit
     from maxcon.fitting import methods as methods
     from maxcon.minimax import MinimaxFit as MinimaxFit
     from maxcon.minimax import minimax_fit as minimax_fit
     from maxcon.problem import Consensus as Consensus
+    from maxcon.problem import Explanation as Explanation
     from maxcon.problem import LinearProblem as LinearProblem
     from maxcon.problem import hyperplane as hyperplane
     from maxcon.problem import line as line
@@ -23,14 +26,17 @@ __version__ = "0.1.0"
 
 _HOME = {
     "Consensus": "maxcon.problem",
+    "Explanation": "maxcon.problem",
     "LinearProblem": "maxcon.problem",
     "MinimaxFit": "maxcon.minimax",
+    "certify": "maxcon.certifying",
     "fit": "maxcon.fitting",
     "hyperplane": "maxcon.problem",
     "line": "maxcon.problem",
     "methods": "maxcon.fitting",
     "minimax_fit": "maxcon.minimax",
     "plane": "maxcon.problem",
+    "write_certificate": "maxcon.certifying",
 }
 
 __all__ = ["__version__", *sorted(_HOME)]  # noqa: PLE0604

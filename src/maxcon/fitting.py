@@ -1,4 +1,4 @@
-"""The front door: `maxcon.fit`, the table of methods, and the choice behind "auto"."""
+"""The front door: `maxcon.fit` and the table of methods."""
 
 from __future__ import annotations
 
@@ -15,6 +15,7 @@ from maxcon.problem import Consensus, LinearProblem, check_threshold
 from maxcon.problem.validate import check_number
 from maxcon.search.anytime import Method, Progress, Refiner, make_task, run
 from maxcon.search.conclusion import conclude
+from maxcon.search.proof import then_prove
 
 
 @dataclass(frozen=True)
@@ -40,6 +41,10 @@ class MethodEntry:
 
 
 METHODS: dict[str, MethodEntry] = {
+    "auto": MethodEntry(
+        "maxcon.search.portfolio:auto",
+        "exact for d <= 3; else the best proposal, then the exact search for as long as there is time",
+    ),
     "agent": MethodEntry(
         "maxcon.search.agent_removal:agent_removal",
         "the paper's method: a learned agent removes basis points until the rest fits",
@@ -69,7 +74,7 @@ METHODS: dict[str, MethodEntry] = {
         "maxcon.search.sweep:exact_sweep", "the proven optimum, d = 2: sweeps the arrangement of lines"
     ),
     "exact": MethodEntry(
-        "maxcon.search.exact:exact", "the proven optimum, d <= 3: branch and bound with interval stabbing"
+        "maxcon.search.exact:exact", "the proven optimum: branch and bound, over parameters (d <= 3) or over points"
     ),
     "astar": MethodEntry("maxcon.search.astar:astar", "the proven optimum: A* tree search (Chin et al. 2015)"),
     "astar-napa": MethodEntry(
@@ -96,6 +101,7 @@ def fit(
     time_limit: float | None = None,
     refine: str | None = "swap",
     gap: int = 0,
+    certify: bool = False,
     callback: Callable[[Progress], object] | None = None,
     **options: Any,
 ) -> Consensus:
@@ -108,7 +114,7 @@ def fit(
     threshold
         The largest residual of an inlier, in the unit of b.
     method
-        "auto", or a name from `maxcon.methods`.
+        A name from `maxcon.methods`.
     rng
         A seed or a NumPy generator. None stands for the seed 0: the same data get the same answer.
     time_limit
@@ -118,6 +124,10 @@ def fit(
         "swap" also tries to give up one point for several, None does nothing.
     gap
         Stop as soon as the best found is proven to be within so many inliers of the largest possible.
+    certify
+        Prove how good the result is: the exact search follows the method, from its result, until the optimum is proven,
+        the gap is reached or the time is over. The method itself then has half of the time. Without a time limit a
+        proof can take long where there are many outliers and more than three parameters.
     callback
         Called with a `Progress` whenever the best set or the bound improves; a true return value stops the fit.
     **options
@@ -149,24 +159,21 @@ def fit(
     if callback is not None and not callable(callback):
         raise TypeError(f"callback must be callable, but it is a {type(callback).__name__}")
     refiner = _check_refine(refine)
-    name = choose_method(problem) if method == "auto" else _check_method(method)
-    function = METHODS[name].load()
-    _check_options(name if method != "auto" else f"{name} (chosen by auto)", function, options)
+    if not isinstance(certify, bool):
+        raise TypeError(f"certify must be True or False, but it is {certify!r}")
+    function = METHODS[_check_method(method)].load()
+    _check_options(method, function, options)
 
     task = make_task(problem, threshold, generator, time_limit, int(gap))
-    best = run(task, function(task, **options), refiner, callback)
-    result = conclude(task, best, name, seed, 0.0)
+    steps = then_prove(task, function, options) if certify else function(task, **options)
+    best = run(task, steps, refiner, callback)
+    result = conclude(task, best, method, seed, 0.0)
     return replace(result, seconds=time.perf_counter() - began)
 
 
 def methods() -> dict[str, str]:
     """Return the name of every method with one line on what it does."""
     return {name: entry.summary for name, entry in METHODS.items()}
-
-
-def choose_method(problem: LinearProblem) -> str:
-    """Return what "auto" means for `problem`: the proven optimum where it is cheap, else what finds most."""
-    return "exact" if problem.n_params <= 3 else "peel"
 
 
 def _check_rng(rng: Any) -> tuple[np.random.Generator, int | None]:
@@ -202,7 +209,7 @@ def _check_method(method: Any) -> str:
     if not isinstance(method, str):
         raise TypeError(f"method must be a string, but it is {method!r}")
     if method not in METHODS:
-        raise ValueError(f"method must be 'auto' or one of {', '.join(METHODS)}, but it is {method!r}")
+        raise ValueError(f"method must be one of {', '.join(METHODS)}, but it is {method!r}")
     return method
 
 

@@ -89,7 +89,7 @@ def test_rates(given, rates):
         (("--n", "1e3"), "but it holds '1e3'"),
         (("--n", ","), "--n-points must list at least one"),
         (("--instances", "0"), "Invalid value for '--instances'"),
-        (("--methods", "magic"), "--methods must be among agent,"),
+        (("--methods", "magic"), "--methods must be among auto, agent,"),
         (("--methods", ","), "--methods must list at least one"),
         (("--methods", "greedy,greedy"), "two methods are named 'greedy'"),
         (("--weights", "x"), "--weights must be NAME=FILE"),

@@ -36,7 +36,7 @@ def test_json_holds_everything(run, points):
     table = np.loadtxt(points, delimiter=",", skiprows=1)
     expected = maxcon.fit(maxcon.line(table[:, 0], table[:, 1]), 0.06, method="greedy", rng=0)
     for field in dataclasses.fields(maxcon.Consensus):
-        if field.name != "seconds":
+        if field.name not in {"seconds", "problem"}:
             value = getattr(expected, field.name)
             assert record[field.name] == (value.tolist() if isinstance(value, np.ndarray) else value), field.name
     assert 0 < record["seconds"] < 60
@@ -115,7 +115,7 @@ def test_options_are_read_as_json_or_text():
         (("--threshold", 0), "threshold must be a positive finite number, but it is 0.0"),
         (("--threshold", "nan"), "threshold must be"),
         (("--threshold", "inf"), "threshold must be"),
-        (("--method", "magic"), "method must be 'auto' or one of agent,"),
+        (("--method", "magic"), "method must be one of auto, agent,"),
         (("--time-limit", 0), "time_limit must be a positive number"),
         (("--option", "tries"), "--option must be KEY=VALUE, but it is 'tries'"),
         (("--option", "tries=3"), "unknown option 'tries' for method"),

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 import maxcon
-from maxcon.certify import issue, save
-from maxcon.certify.certificate import dumps
+from maxcon.certification import issue, save
+from maxcon.certification.certificate import dumps
 from maxcon.search.anytime import make_task
 from maxcon.search.witness import make_witness
 

@@ -8,7 +8,7 @@ import pytest
 
 import maxcon
 import oracles
-from maxcon.problem import Consensus, check_indices, check_model, check_threshold, inlier_slack
+from maxcon.problem import Consensus, LinearProblem, check_indices, check_model, check_threshold, inlier_slack
 from maxcon.problem.validate import check_array, check_number
 
 # ------------------------------------------------------------------------------------------------- threshold
@@ -166,6 +166,7 @@ def test_result_is_frozen_and_says_what_it_is():
         method="greedy",
         seed=0,
         seconds=0.0015,
+        problem=LinearProblem(np.eye(3, 2), np.zeros(3)),
     )
     assert repr(result) == "Consensus(2 of 3 points within 0.25, bounded, gap 1, method 'greedy', 1.50 ms)"
     with pytest.raises(dataclasses.FrozenInstanceError):

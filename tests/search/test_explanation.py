@@ -11,8 +11,8 @@ from numba import config
 import maxcon
 import oracles
 from instances import BUILDERS, synthetic
-from maxcon.certify.certificate import inlier_limit
-from maxcon.certify.exact import ExactData
+from maxcon.certification.certificate import inlier_limit
+from maxcon.certification.exact import ExactData
 from maxcon.search.explanation import explain
 
 compiled_only = pytest.mark.skipif(config.DISABLE_JIT, reason="takes minutes where kernels are interpreted")
@@ -81,7 +81,7 @@ def test_hyperplanes():
     consensus = maxcon.fit(problem, 0.1, method="peel")
     outliers = np.flatnonzero(~consensus.inlier_mask)
     for point in outliers[:3]:
-        answer = explain(problem, consensus, point, time_limit=5)
+        answer = explain(problem, consensus, point, time_limit=1)
         assert_basis(problem, consensus, answer)
         assert 8 <= answer.consensus_with_point <= consensus.n_inliers
         # it is what a model that explains the point explains
@@ -94,8 +94,10 @@ def test_a_hyperplane_that_could_as_well_have_been_another():
     A, b = synthetic(np.random.default_rng(0), 60, 5, 0.1)
     problem = maxcon.LinearProblem(A, b)
     consensus = maxcon.fit(problem, 0.09, method="peel")  # less than the noise
-    answers = [explain(problem, consensus, point) for point in np.flatnonzero(~consensus.inlier_mask)]
-    assert sorted(answer.lost for answer in answers if answer.proven) == [0, 1]
+    outliers = np.flatnonzero(~consensus.inlier_mask)
+    answers = [explain(problem, consensus, point, time_limit=0.5) for point in outliers]
+    assert sorted(answer.lost for answer in answers if answer.proven) == [0, 1]  # the others cost most of the points
+    assert min(answer.lost for answer in answers if not answer.proven) > 20
     for answer in answers:
         assert_basis(problem, consensus, answer)
 

@@ -13,9 +13,9 @@ from numba import config
 import maxcon
 import oracles
 from instances import BUILDERS, synthetic
-from maxcon.certify.certificate import Group, inlier_limit
-from maxcon.certify.exact import ExactData
-from maxcon.certify.verify import follow, is_refuted
+from maxcon.certification.certificate import Group, inlier_limit
+from maxcon.certification.exact import ExactData
+from maxcon.certification.verify import follow, is_refuted
 from maxcon.search.anytime import make_task
 from maxcon.search.exclusion import excludes
 from maxcon.search.witness import make_witness

@@ -97,7 +97,8 @@ def parameters(model: Sequence[float] | np.ndarray[Any, Any], family: str) -> di
 
 def consensus_json(consensus: Consensus, about: Mapping[str, Any]) -> bytes:
     """Return a JSON object: `about`, then every field of the consensus; one line a key, NaN as null."""
-    record = dict(about) | {field.name: getattr(consensus, field.name) for field in fields(consensus)}
+    names = (field.name for field in fields(consensus) if field.name != "problem")
+    record = dict(about) | {name: getattr(consensus, name) for name in names}
     lines = [f"  {json.dumps(key)}: {json.dumps(plain(value), allow_nan=False)}" for key, value in record.items()]
     return ("{\n" + ",\n".join(lines) + "\n}\n").encode()
 

@@ -8,7 +8,7 @@ from dataclasses import asdict
 import click
 from rich.text import Text
 
-from maxcon.certify import Certificate, CertificateError, VerificationReport, load, verify
+from maxcon.certification import Certificate, CertificateError, VerificationReport, load, verify
 from maxcon.cli.errors import Failure
 from maxcon.cli.output import check_output, write_output
 from maxcon.cli.present import borderless, console, duration, plain

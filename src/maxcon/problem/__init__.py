@@ -1,6 +1,7 @@
 """What is fitted: data, residual and threshold, validated once and then frozen; and the result type."""
 
 from maxcon.problem.consensus import Consensus, Status
+from maxcon.problem.explanation import Explanation
 from maxcon.problem.linear import LinearProblem, hyperplane, line, plane
 from maxcon.problem.protocol import Problem
 from maxcon.problem.tolerance import inlier_slack
@@ -8,6 +9,7 @@ from maxcon.problem.validate import check_indices, check_model, check_threshold
 
 __all__ = [
     "Consensus",
+    "Explanation",
     "LinearProblem",
     "Problem",
     "Status",

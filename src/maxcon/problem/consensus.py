@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from importlib import import_module
 from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
+
+from maxcon.problem.explanation import Explanation
+from maxcon.problem.linear import LinearProblem
 
 Status = Literal["optimal", "bounded", "heuristic", "infeasible"]
 
@@ -44,6 +48,8 @@ class Consensus:
         What seeded the random numbers (drawn or not), or None where a generator was passed.
     seconds
         Wall-clock time of the fit.
+    problem
+        What was fitted.
     """
 
     model: NDArray[np.float64]
@@ -59,6 +65,30 @@ class Consensus:
     method: str
     seed: int | None
     seconds: float
+    problem: LinearProblem = field(repr=False)
+
+    def explain(self, point: int, *, time_limit: float | None = 10.0) -> Explanation:
+        """Explain why a point is no inlier: which inliers speak against it, and what it would cost to force it in.
+
+        Parameters
+        ----------
+        point
+            The index of a point that is not among the inliers.
+        time_limit
+            Seconds after which the best so far is returned; None for no limit.
+
+        Raises
+        ------
+        TypeError
+            If `point` is not a whole number.
+        ValueError
+            If there is no such point, or it is an inlier.
+        """
+        # A result is what searches return, and this question takes a search: it is looked up when it is asked.
+        explanation: Explanation = import_module("maxcon.search.explanation").explain(
+            self.problem, self, point, time_limit=time_limit
+        )
+        return explanation
 
     def __repr__(self) -> str:
         return (

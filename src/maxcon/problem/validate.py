@@ -76,11 +76,11 @@ def check_threshold(value: Any) -> float:
     return threshold
 
 
-def check_model(value: ArrayLike, n_params: int) -> NDArray[np.float64]:
+def check_model(value: ArrayLike, n_params: int, name: str = "model") -> NDArray[np.float64]:
     """Return `value` as a model of `n_params` parameters; ValueError or TypeError otherwise."""
-    model = check_array(value, "model", 1)
+    model = check_array(value, name, 1)
     if model.shape != (n_params,):
-        raise ValueError(f"model must have shape ({n_params},), but its shape is {model.shape}")
+        raise ValueError(f"{name} must have shape ({n_params},), but its shape is {model.shape}")
     return model
 
 

@@ -49,6 +49,36 @@ def conclude(task: Task, best: Best, method: str, seed: int | None, seconds: flo
         method=method,
         seed=seed,
         seconds=seconds,
+        problem=problem,
+    )
+
+
+def judge(task: Task, model: NDArray[np.float64], upper_bound: int, seconds: float) -> Consensus:
+    """Return the result that a given model is, whoever found it: its inliers as they are, under a proven bound."""
+    problem = task.problem
+    residuals = problem.residuals(model)
+    mask = residuals <= task.threshold + inlier_slack(task.threshold, problem.scale)
+    n_inliers = int(mask.sum())
+    status: Status = "heuristic"
+    if n_inliers == upper_bound:
+        status = "optimal" if n_inliers > 0 else "infeasible"
+    elif upper_bound < problem.n_points:
+        status = "bounded"
+    return Consensus(
+        model=model,
+        inlier_mask=mask,
+        n_inliers=n_inliers,
+        upper_bound=upper_bound,
+        gap=upper_bound - n_inliers,
+        status=status,
+        residuals=residuals,
+        basis=minimax_fit(problem, mask).basis if mask.any() else np.empty(0, dtype=np.int64),
+        path=np.empty(0, dtype=np.int64),
+        threshold=task.threshold,
+        method="given",
+        seed=None,
+        seconds=seconds,
+        problem=problem,
     )
 
 
@@ -85,4 +115,5 @@ def _infeasible(problem: LinearProblem, threshold: float, method: str, seed: int
         method=method,
         seed=seed,
         seconds=seconds,
+        problem=problem,
     )

@@ -3,53 +3,28 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from itertools import chain
 
 import numpy as np
 from numpy.typing import NDArray
 
 from maxcon.minimax import allocate, linear_rows, minimax_fit
 from maxcon.minimax.linear import BASIS_TOLERANCE, INFEASIBLE, OK, cold_fit
-from maxcon.problem import Consensus, LinearProblem, inlier_slack
+from maxcon.problem import Consensus, Explanation, LinearProblem, inlier_slack
 from maxcon.search.anytime import Step, Task, make_task, run
-from maxcon.search.exact import MOST_PARAMETERS, exact
+from maxcon.search.exact import MOST_PARAMETERS
+from maxcon.search.partition import exact_partition
 from maxcon.search.peel import peel, peel_improve
+from maxcon.search.proposal import propose
 from maxcon.search.refine import swap_refinement
-from maxcon.search.witness import make_witness
+from maxcon.search.stabbing import exact_stabbing
 
-#: Where the exact search does not serve: so many starts, and a witness of so many bases, which proves small losses.
-RESTARTS, MOST_BASES = 20, 2_000
-
-
-@dataclass(frozen=True, eq=False)
-class Explanation:
-    """Why a point is no inlier.
-
-    Attributes
-    ----------
-    point
-        Its index.
-    basis
-        Indices, ascending: the point and at most d inliers that no model explains together within the
-        threshold. Empty if the inliers and the point can be explained together (then the consensus was not
-        the largest).
-    consensus_with_point
-        The most inliers that were found for a model that explains the point; 0 if none does.
-    lost
-        How many inliers forcing it in costs: those of the consensus minus these.
-    proven
-        Whether no model that explains the point has more inliers than that.
-    """
-
-    point: int
-    basis: NDArray[np.int64]
-    consensus_with_point: int
-    lost: int
-    proven: bool
+#: Models that explain one given outlier leave out many points: that takes more starts than usual.
+RESTARTS = 30
 
 
 def explain(
-    problem: LinearProblem, consensus: Consensus, point: int, *, time_limit: float | None = None
+    problem: LinearProblem, consensus: Consensus, point: int, *, time_limit: float | None = 10.0
 ) -> Explanation:
     """Explain why a point is no inlier of a result.
 
@@ -75,9 +50,8 @@ def explain(
     -----
     The inliers have a model within the threshold, so if they have none together with the point, the basis of
     their minimax fit (at most d + 1 points) holds the point. What it costs to force it in is the consensus of a
-    problem in which the point is repeated so often that no model can do without it: exact by interval stabbing
-    with up to three parameters; otherwise peeled from the inliers and from robust fits and, where that succeeds,
-    proven by a witness.
+    problem in which the point is repeated so often that no optimal model can do without it, found and proven by the
+    exact search.
     """
     N = problem.n_points
     if isinstance(point, bool) or not isinstance(point, (int, np.integer)):
@@ -97,12 +71,13 @@ def explain(
     if len(basis) == 1:  # no parameter moves its residual
         return Explanation(point, basis, 0, consensus.n_inliers, True)
 
-    # With the point alone counting for more than all others, an optimal model explains it.
-    extra = N
+    # To leave the point and all its repetitions out costs more than this set leaves out: an optimal model explains it.
+    start = _with_point(problem, consensus, point, together)
+    extra = N - int(np.count_nonzero(start)) + 1
     repeated = np.r_[np.arange(N), np.full(extra, point)]
     insisting = LinearProblem(problem.A[repeated], problem.b[repeated])
     task = make_task(insisting, consensus.threshold, np.random.default_rng(0), time_limit)
-    start = np.r_[_with_point(problem, consensus, point, together), np.ones(extra, dtype=np.bool_)]
+    start = np.r_[start, np.ones(extra, dtype=np.bool_)]
     best = run(task, _search(task, start), swap_refinement)
     found = max(best.size - extra, 1)
     return Explanation(point, basis, found, consensus.n_inliers - found, best.gap <= 0)
@@ -141,10 +116,10 @@ def _search(task: Task, start: NDArray[np.bool_]) -> Iterator[Step]:
     best = peel_improve(task, start)
     yield Step(subset=best)
     if task.problem.n_params <= MOST_PARAMETERS:
-        yield from exact(task)
+        yield from exact_stabbing(task)
         return
-    for step in peel(task, start="gnc", restarts=RESTARTS):
+    for step in chain(peel(task, start="gnc", restarts=RESTARTS), propose(task)):
         if step.subset is not None and np.count_nonzero(step.subset) > np.count_nonzero(best):
             best = step.subset
         yield step
-    yield Step(upper_bound=make_witness(task, best, max_bases=MOST_BASES).upper_bound)
+    yield from exact_partition(task, start=best)

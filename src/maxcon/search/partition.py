@@ -23,7 +23,6 @@ from maxcon.search.anytime import Step, Task
 from maxcon.search.partition_jobs import LIST_TASKS, RUN_TASKS, SOLVE_NODES
 from maxcon.search.partition_machine import BUSY, DONE, FULL, advance
 from maxcon.search.partition_moves import sum_up
-from maxcon.search.partition_start import peeled_start
 from maxcon.search.partition_state import (
     BEST,
     CUR,
@@ -39,11 +38,19 @@ from maxcon.search.partition_state import (
     SearchState,
     allocate_state,
     grow,
+    state_bytes,
 )
 from maxcon.search.partition_tree import HEIGHT, HI, LEFT, LO, RIGHT, SIZE, MergeTree, leaf_size, merge_tree
+from maxcon.search.proposal import best_proposal
 
 #: How long the kernels run before the caller hears from them, in seconds, and the work for the first time.
 INTERVAL, FIRST_BUDGET = 0.02, 20_000
+
+#: All threads together may take so much memory, in bytes; beyond, the search ends with what it has proven.
+MOST_BYTES = 4 << 30
+
+#: Stands beside what `advance` returns: the work allowed is spent.
+SPENT = 3
 
 #: Groups are dealt anew where the outliers of the incumbent have fallen by this part since they were dealt.
 DEAL_ANEW = 0.05
@@ -53,8 +60,27 @@ DEAL_ANEW = 0.05
 LITTLE_WORK, GROWTH = 5_000_000, 1.8
 
 
+def check_jobs(n_jobs: int) -> int:
+    """Return how many threads that means; TypeError or ValueError if it is not -1 or a whole number of at least 1."""
+    if isinstance(n_jobs, bool) or not isinstance(n_jobs, (int, np.integer)):
+        raise TypeError(f"n_jobs must be a whole number, but it is {n_jobs!r}")
+    if n_jobs < 1 and n_jobs != -1:
+        raise ValueError(f"n_jobs must be -1 or at least 1, but it is {n_jobs}")
+    return usable_cores() if n_jobs == -1 else int(n_jobs)
+
+
+def usable_cores() -> int:
+    """Return how many cores this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
 def exact_partition(
-    task: Task, *, start: NDArray[np.bool_] | None = None, leaf: int | None = None, n_jobs: int = 1
+    task: Task,
+    *,
+    start: NDArray[np.bool_] | None = None,
+    leaf: int | None = None,
+    n_jobs: int = -1,
+    max_work: int | None = None,
 ) -> Iterator[Step]:
     """Search until the largest consensus is proven; the bound falls on the way.
 
@@ -68,6 +94,9 @@ def exact_partition(
         How many points a group has at first, at least 1; None: from d and the number of outliers of `start`.
     n_jobs
         How many threads to use; -1 for one a core. Neither the set nor the bound depends on it, where time suffices.
+    max_work
+        Stop after about so much work, in columns of linear programmes, with one thread after exactly so much; None for
+        no limit. A thread does some 3e7 a second.
 
     Yields
     ------
@@ -79,7 +108,11 @@ def exact_partition(
     ValueError
         If an option has the wrong shape or is outside its range.
     """
-    return PartitionSearch(task, start=start, leaf=leaf, n_jobs=n_jobs).steps()
+    return PartitionSearch(task, start=start, leaf=leaf, n_jobs=n_jobs, max_work=max_work).steps()
+
+
+class _SpentError(Exception):
+    """The work or the memory allowed is spent."""
 
 
 class PartitionSearch:
@@ -87,7 +120,7 @@ class PartitionSearch:
 
     Parameters
     ----------
-    task, start, leaf, n_jobs
+    task, start, leaf, n_jobs, max_work
         See `exact_partition`.
 
     Attributes
@@ -99,7 +132,13 @@ class PartitionSearch:
     """
 
     def __init__(
-        self, task: Task, *, start: NDArray[np.bool_] | None = None, leaf: int | None = None, n_jobs: int = 1
+        self,
+        task: Task,
+        *,
+        start: NDArray[np.bool_] | None = None,
+        leaf: int | None = None,
+        n_jobs: int = -1,
+        max_work: int | None = None,
     ) -> None:
         n_points = task.problem.n_points
         if start is not None and (start.shape != (n_points,) or start.dtype != np.bool_):
@@ -108,15 +147,15 @@ class PartitionSearch:
             )
         if leaf is not None and leaf < 1:
             raise ValueError(f"leaf must be at least 1, but it is {leaf}")
-        if n_jobs < 1 and n_jobs != -1:
-            raise ValueError(f"n_jobs must be -1 or at least 1, but it is {n_jobs}")
         self.task = task
         self.inliers = np.zeros(n_points, dtype=np.bool_)
         self.least_outliers = 0
         self._improved = False
         self._start = start
         self._leaf = leaf
-        self._n_jobs = (os.cpu_count() or 1) if n_jobs == -1 else n_jobs
+        self._n_jobs = check_jobs(n_jobs)
+        self._max_work = np.iinfo(np.int64).max if max_work is None else max_work
+        self._work_before = 0  # of states that are gone
         self._budget = FIRST_BUDGET
         self._tree: MergeTree | None = None
         self._states: list[SearchState] = []
@@ -146,19 +185,22 @@ class PartitionSearch:
 
     def steps(self) -> Iterator[Step]:
         """Run the search; see `exact_partition`."""
-        rows, limit = self.task.rows, self.task.limit
-        start = peeled_start(rows, limit, self.task.rng) if self._start is None else self._start
+        limit = self.task.limit
+        start = best_proposal(self.task) if self._start is None else self._start
         residuals = self._residuals_of_fit(start)
         within = residuals <= limit
         self.inliers = within if np.count_nonzero(within) >= np.count_nonzero(start) else start.copy()
         dealt = len(self.inliers) + 1
         if self.inliers.any():
             yield Step(subset=self.inliers.copy())
-        while self.n_outliers < (1.0 - DEAL_ANEW) * dealt and self.least_outliers < self.n_outliers:
-            dealt = self.n_outliers
-            self._deal(self._residuals_of_fit(self.inliers))
-            yield from self._solve_nodes(dealt)
-        yield from self._raise_root()
+        try:
+            while self.n_outliers < (1.0 - DEAL_ANEW) * dealt and self.least_outliers < self.n_outliers:
+                dealt = self.n_outliers
+                self._deal(self._residuals_of_fit(self.inliers))
+                yield from self._solve_nodes(dealt)
+            yield from self._raise_root()
+        except _SpentError:  # what has been proven stands
+            yield self._news()
 
     def _residuals_of_fit(self, subset: NDArray[np.bool_]) -> NDArray[np.float64]:
         """Return the residuals of all points under the minimax fit of `subset`, shape (N,), in the unit of the rows."""
@@ -174,7 +216,12 @@ class PartitionSearch:
         """Deal the points into groups by their residuals under the incumbent, and allocate a state for each thread."""
         rows = self.task.rows
         leaf = leaf_size(len(rows.b), len(rows.At), self.n_outliers) if self._leaf is None else self._leaf
+        self._work_before = self._work()
         self._tree = merge_tree(residuals, leaf)
+        bytes_each = state_bytes(len(rows.At), len(rows.b), self._tree)
+        self._n_jobs = min(self._n_jobs, MOST_BYTES // bytes_each)
+        if self._n_jobs == 0:
+            raise _SpentError
         self._states = [
             allocate_state(rows.At, rows.b, self.task.limit, self._tree, residuals) for _ in range(self._n_jobs)
         ]
@@ -226,14 +273,22 @@ class PartitionSearch:
                 return  # the arithmetic failed somewhere: the bound stays where it is
             step = 1 + max(0, int(np.log(LITTLE_WORK / max(self._work() - worked, 1)) / np.log(GROWTH)))
 
+    def _grow(self, state: SearchState) -> SearchState:
+        """Return the state with more room; _SpentError where that is too much memory."""
+        if sum(array.nbytes for array in state) > MOST_BYTES // self._n_jobs // 2:
+            raise _SpentError
+        return grow(state)
+
     def _work(self) -> int:
-        return sum(int(state.registers[WORK]) for state in self._states)
+        """Return how many columns of linear programmes were looked at."""
+        return self._work_before + sum(int(state.registers[WORK]) for state in self._states)
 
     def _news(self) -> Step:
         """Return the largest set, if it is new, and the bound proven so far."""
-        nodes = self._states[0].nodes.copy()
-        sum_up(nodes, PROVEN)
-        self.least_outliers = max(self.least_outliers, int(nodes[0, PROVEN]))
+        if self._states:
+            nodes = self._states[0].nodes.copy()
+            sum_up(nodes, PROVEN)
+            self.least_outliers = max(self.least_outliers, int(nodes[0, PROVEN]))
         subset = self.inliers.copy() if self._improved else None
         self._improved = False
         return Step(subset=subset, upper_bound=len(self.inliers) - self.least_outliers)
@@ -268,15 +323,19 @@ class PartitionSearch:
         status = FULL
         while status != DONE:
             began = time.perf_counter()
-            status = advance(state, self._budget)
+            left = self._max_work - self._work()
+            status = advance(state, min(self._budget, left)) if left > 0 else SPENT
             if status == FULL:
-                self._states[0] = state = grow(state)
+                self._states[0] = state = self._grow(state)
             elif status == BUSY:
                 seconds = max(time.perf_counter() - began, 1e-6)
                 self._budget = 100 + int(self._budget * min(max(INTERVAL / seconds, 0.3), 3.0))
+            if status in (BUSY, SPENT):
                 if state.registers[BEST] < state.registers[FOUND]:
                     self._consider(int(state.registers[BEST]), state.best_out)
                 yield self._news()
+            if status == SPENT:
+                raise _SpentError
         self._consider(int(state.registers[FOUND]), state.found_out)
         for worker in range(1, len(self._states)):
             if kind == SOLVE_NODES:
@@ -302,7 +361,11 @@ class PartitionSearch:
                 while status != DONE and not stop.is_set():
                     status = advance(self._states[worker], self._budget)
                     if status == FULL:
-                        self._states[worker] = grow(self._states[worker])
+                        try:
+                            self._states[worker] = self._grow(self._states[worker])
+                        except _SpentError:
+                            stop.set()
+                            raise
                 if status == DONE:
                     state = self._states[worker]
                     ended[k] = worker, int(state.registers[FOUND]), state.found_out.copy()
@@ -316,6 +379,8 @@ class PartitionSearch:
                         self._consider(*ended[collected][1:])
                         collected += 1
                     yield self._news()
+                    if self._work() >= self._max_work:
+                        raise _SpentError
             finally:
                 stop.set()
         for future in futures:
@@ -345,7 +410,7 @@ class PartitionSearch:
         source = self._states[0]
         n_tasks = int(source.registers[LINKS])
         while len(self._states[worker].task_bounds) <= n_tasks:
-            self._states[worker] = grow(self._states[worker])
+            self._states[worker] = self._grow(self._states[worker])
         target = self._states[worker]
         target.nodes[:] = source.nodes
         target.registers[LINKS] = n_tasks

@@ -214,6 +214,15 @@ def allocate_state(
     return state
 
 
+def state_bytes(n_params: int, n_points: int, tree: MergeTree) -> int:
+    """Return about how many bytes `allocate_state` takes."""
+    n, heights = n_params + 1, int(tree.nodes[0, HEIGHT]) + 1
+    programmes = heights * 2 * n_points * (n_params + 7)
+    stack = 64 * (N_FRAME_COLUMNS + 3 * n * (n + 2) + 2 * n_points)
+    models = min(MODEL_BYTES, len(tree.nodes) * n_points * MODELS_KEPT)
+    return 8 * (programmes + stack + n_points * (n_params + 20) + 64 * len(tree.nodes)) + models
+
+
 def grow(state: SearchState) -> SearchState:
     """Return the same state with twice the room on its stacks."""
     grown = {}

@@ -4,7 +4,7 @@ For disjoint groups of points every model leaves out at least the sum of what it
 leaves out of a group is proven by a pool of bases, that is of sets of at most d + 1 points that no model
 explains, and a short proof that no fewer points hit all of them (`witness_kernels`). So a checker needs
 neither this file nor the engine: a basis is refuted by one linear system, and the rest is counting
-(`maxcon.certify.verify`).
+(`maxcon.certification.verify`).
 
 The points are sorted by their residuals and dealt round-robin into parts, so that each has its share of
 outliers among enough inliers. Small parts are cheap but lose something: their own best model leaves out fewer

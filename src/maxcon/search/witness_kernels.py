@@ -12,7 +12,7 @@ data, or only up to rounding, is for the caller to say.
 
 The search writes down what it rests on, node by node in the order in which they are visited: a branch as ``0,
 basis``, an end as ``count, basis, ..., basis``. Who reads that needs no search of his own
-(`maxcon.certify.verify`).
+(`maxcon.certification.verify`).
 """
 
 from __future__ import annotations

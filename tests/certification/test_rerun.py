@@ -11,9 +11,9 @@ from certificates import certified
 import maxcon
 import oracles
 from instances import BUILDERS, synthetic
-from maxcon.certify import verify
-from maxcon.certify.certificate import inlier_limit
-from maxcon.certify.rerun import prove_again
+from maxcon.certification import verify
+from maxcon.certification.certificate import inlier_limit
+from maxcon.certification.rerun import prove_again
 
 TIED = ("quantised", "quantised_halves", "tenths", "duplicate_rows", "opposite_rows", "one_x", "zero_rows", "years")
 

@@ -7,8 +7,8 @@ import json
 import numpy as np
 
 import maxcon
-from maxcon.certify import issue
-from maxcon.certify.certificate import _seal, dumps, loads
+from maxcon.certification import issue
+from maxcon.certification.certificate import _seal, dumps, loads
 from maxcon.search.anytime import make_task
 from maxcon.search.witness import make_witness
 

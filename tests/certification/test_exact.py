@@ -10,7 +10,7 @@ import pytest
 
 import oracles
 from instances import BUILDERS
-from maxcon.certify.exact import ExactData, independent_columns, within
+from maxcon.certification.exact import ExactData, independent_columns, within
 
 
 def test_within_is_decided_by_the_exact_residual():

@@ -14,8 +14,8 @@ from certificates import certified, forge, solve
 import maxcon
 import oracles
 from instances import BUILDERS, synthetic
-from maxcon.certify import Group, issue, save, verify
-from maxcon.certify.verify import follow
+from maxcon.certification import Group, issue, save, verify
+from maxcon.certification.verify import follow
 
 
 @pytest.fixture(scope="module")
@@ -292,7 +292,7 @@ def test_the_checker_imports_nothing_of_the_search(made, tmp_path):
     code = """if True:
         import sys
         import numpy as np
-        from maxcon.certify import load, verify
+        from maxcon.certification import load, verify
         data = np.load("d.npz")
         report = verify(load("c.json"), data["A"], data["b"])
         assert report.accepted

@@ -11,8 +11,8 @@ from certificates import certified
 
 import maxcon
 from instances import synthetic
-from maxcon.certify import CertificateError, load, save
-from maxcon.certify.certificate import SLACK, _seal, data_digest, dumps, inlier_limit, loads
+from maxcon.certification import CertificateError, load, save
+from maxcon.certification.certificate import SLACK, _seal, data_digest, dumps, inlier_limit, loads
 from maxcon.problem import inlier_slack, tolerance
 
 

@@ -12,9 +12,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from maxcon.certify.certificate import Certificate, Group, data_digest, inlier_limit
-from maxcon.certify.exact import ExactData, within
-from maxcon.certify.rerun import Rerun, prove_again
+from maxcon.certification.certificate import Certificate, Group, data_digest, inlier_limit
+from maxcon.certification.exact import ExactData, within
+from maxcon.certification.rerun import Rerun, prove_again
 
 
 class _Refused(Exception):  # noqa: N818  (carries the reason to the report)

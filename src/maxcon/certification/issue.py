@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from maxcon.certify.certificate import Certificate, Group, data_digest, inlier_limit
-from maxcon.certify.exact import ExactData, within
-from maxcon.certify.verify import is_refuted
+from maxcon.certification.certificate import Certificate, Group, data_digest, inlier_limit
+from maxcon.certification.exact import ExactData, within
+from maxcon.certification.verify import is_refuted
 
 if TYPE_CHECKING:
     from maxcon.problem import Consensus, LinearProblem

@@ -17,7 +17,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from maxcon.certify.exact import ExactData, independent_columns, within
+from maxcon.certification.exact import ExactData, independent_columns, within
 
 Floats = NDArray[np.float64]
 

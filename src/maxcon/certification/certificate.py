@@ -1,7 +1,7 @@
 """The certificate: what was found, what is claimed, and what the file itself proves; a JSON file.
 
 It holds no code's word for anything that can be checked: the inliers follow from the model, and the bound from
-`Group`s, whose every step is a linear system or a count (`maxcon.certify.verify`).
+`Group`s, whose every step is a linear system or a count (`maxcon.certification.verify`).
 """
 
 from __future__ import annotations
