@@ -23,6 +23,7 @@ check: $(VENV)/.dev-ready
 bench: $(VENV)/.dev-ready
 	$(BIN)/python benchmarks/engine.py
 	$(BIN)/python benchmarks/agent.py
+	$(BIN)/python benchmarks/exact.py
 
 $(VENV)/bin/python:
 	$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "maxcon needs Python 3.11 or later; set PYTHON=")'

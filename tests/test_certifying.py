@@ -93,7 +93,16 @@ def test_without_a_time_limit_auto_ends_by_itself_and_repeats_itself():
     assert np.array_equal(first.inlier_mask, second.inlier_mask)
 
 
+@pytest.fixture
+def sigint():
+    """Let SIGINT interrupt, which in the background job of a shell it does not."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
 @pytest.mark.skipif(not hasattr(signal, "pthread_kill"), reason="sends a signal to this process")
+@pytest.mark.usefixtures("sigint")
 @pytest.mark.parametrize("n_jobs", [1, 2])
 def test_ctrl_c_at_many_moments_leaves_a_set_and_a_bound(n_jobs):
     problem = synthetic_hyperplane(np.random.default_rng(1), 100, 0.5, 8)

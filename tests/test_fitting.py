@@ -223,3 +223,21 @@ def test_a_long_walk_of_the_agent_can_be_stopped():
     result = maxcon.fit(problem, 0.1, method="agent", time_limit=0.05, callback=seen.append)
     check(result, problem, 0.1)
     assert not seen  # the walk had not ended
+
+
+def test_compiling_does_not_count_against_the_time_limit(problem, monkeypatch):
+    """As if every step took a minute of compiling."""
+    compiled = [0.0]
+    monkeypatch.setattr(maxcon.search.anytime, "compile_seconds", lambda: compiled[0])
+    task = make_task(problem, 0.1, np.random.default_rng(0), time_limit=0.02)
+
+    def steps():
+        for _ in range(3):
+            time.sleep(0.03)
+            compiled[0] += 60
+            yield Step()
+        compiled[0] = 0.0
+        yield Step(upper_bound=50)
+        raise AssertionError("the time is over")
+
+    assert run(task, steps()).upper_bound == 50

@@ -21,15 +21,25 @@ if TYPE_CHECKING:
     from maxcon.problem import hyperplane as hyperplane
     from maxcon.problem import line as line
     from maxcon.problem import plane as plane
+    from maxcon.search.alternatives import AlternativeOptima as AlternativeOptima
+    from maxcon.search.alternatives import alternative_optima as alternative_optima
+    from maxcon.search.threshold_curve import ConsensusCurve as ConsensusCurve
+    from maxcon.search.threshold_curve import consensus_curve as consensus_curve
+    from maxcon.vision import find_fundamental as find_fundamental
 
 __version__ = "0.1.0"
 
 _HOME = {
+    "AlternativeOptima": "maxcon.search.alternatives",
     "Consensus": "maxcon.problem",
+    "ConsensusCurve": "maxcon.search.threshold_curve",
     "Explanation": "maxcon.problem",
     "LinearProblem": "maxcon.problem",
     "MinimaxFit": "maxcon.minimax",
+    "alternative_optima": "maxcon.search.alternatives",
     "certify": "maxcon.certifying",
+    "consensus_curve": "maxcon.search.threshold_curve",
+    "find_fundamental": "maxcon.vision",
     "fit": "maxcon.fitting",
     "hyperplane": "maxcon.problem",
     "line": "maxcon.problem",

@@ -214,6 +214,8 @@ def _check_method(method: Any) -> str:
 
 
 def _check_options(name: str, function: Method, options: dict[str, Any]) -> None:
+    if not options:
+        return
     known = list(inspect.signature(function).parameters)[1:]
     for option in options:
         if option not in known:

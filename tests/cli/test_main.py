@@ -5,7 +5,7 @@ import pytest
 
 import maxcon
 
-COMMANDS = ("fit", "demo", "methods", "agents", "train", "evaluate", "verify")
+COMMANDS = ("fit", "fit-pair", "curve", "alternatives", "demo", "methods", "agents", "train", "evaluate", "verify")
 
 
 def python(code):
@@ -55,7 +55,9 @@ def test_as_a_program():
     result = python("import sys; sys.argv = ['maxcon', 'fit', 'none.csv', '--model', 'line', '--threshold', '1']\n"
                     "from maxcon.cli import main; sys.exit(main())")  # fmt: skip
     assert (result.returncode, result.stdout) == (2, "")
-    assert result.stderr == "maxcon fit: error: there is no file 'none.csv'\n"
+    assert result.stderr == (
+        "maxcon fit: error: there is no file 'none.csv', and no table of that name: belgian_calls, cyg_ob1\n"
+    )
 
 
 def test_help_imports_no_heavy_package():

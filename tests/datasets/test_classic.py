@@ -35,7 +35,7 @@ def best_sets(problem: LinearProblem, threshold: float) -> tuple[int, set[frozen
 
 def test_names_and_exports():
     assert TABLES == ("belgian_calls", "cyg_ob1")
-    assert set(datasets.__all__) == {"TABLES", "Table", "belgian_calls", "cyg_ob1", "load_table"}
+    assert set(datasets.__all__) >= {"TABLES", "Table", "belgian_calls", "cyg_ob1", "load_table"}
 
 
 def test_belgian_calls_as_published():

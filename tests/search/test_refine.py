@@ -89,6 +89,8 @@ def test_no_basis_point_is_worth_swapping(name):
         for p in minimax_fit(task.problem, subset).basis:
             rest = subset.copy()
             rest[p] = False
+            if rest.any() and f(task, rest) >= f(task, subset) * (1 - 1e-9):
+                continue  # a tie: another basis does without it
             others = [i for i in np.flatnonzero(~subset) if rest.any() and fits(with_point(rest, i))]
             if len(others) >= 2:
                 stuck += 1

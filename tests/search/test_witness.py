@@ -149,7 +149,7 @@ def test_many_outliers_leave_a_weaker_bound():
     problem = maxcon.LinearProblem(A, b)
     consensus = maxcon.fit(problem, 0.1, method="peel", start="gnc")
     witness = make_witness(task_for(problem, 0.1), consensus.inlier_mask, max_bases=1_000)
-    assert consensus.n_inliers < witness.upper_bound < 75  # disjoint bases alone prove no less than 89
+    assert consensus.n_inliers < witness.upper_bound < 80  # disjoint bases alone prove no less than 89
     check(problem, 0.1, witness)
 
 

@@ -11,8 +11,8 @@ import click
 
 from maxcon import __version__
 
-#: The commands in the order of the help; ``maxcon.cli.NAME`` holds ``command``.
-_COMMANDS = ("fit", "verify", "demo", "methods", "agents", "train", "evaluate")
+#: The commands in the order of the help; ``maxcon.cli.NAME`` holds ``command`` (a dash in NAME is _).
+_COMMANDS = ("fit", "fit-pair", "curve", "alternatives", "verify", "demo", "methods", "agents", "train", "evaluate")
 
 #: What a shell expects of a program that Ctrl-C ended.
 INTERRUPTED = 130
@@ -27,7 +27,7 @@ class _Commands(click.Group):
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
         if cmd_name not in _COMMANDS:
             return None
-        command: click.Command = import_module(f"maxcon.cli.{cmd_name}").command
+        command: click.Command = import_module(f"maxcon.cli.{cmd_name.replace('-', '_')}").command
         return command
 
     def main(

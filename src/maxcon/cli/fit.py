@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import inspect
 import json
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -62,6 +63,16 @@ if TYPE_CHECKING:
     help="Stop when the best found is proven to be within so many inliers of the largest possible.",
 )
 @click.option(
+    "--certify",
+    is_flag=True,
+    help="Prove how good the result is, after any method, until the optimum is proven or the time is over.",
+)
+@click.option(
+    "--certificate",
+    metavar="OUT",
+    help="Write a certificate (JSON), which `maxcon verify` checks; implies --certify.",
+)
+@click.option(
     "--option",
     "options",
     multiple=True,
@@ -85,6 +96,8 @@ def command(
     seed: int,
     time_limit: float | None,
     gap: int,
+    certify: bool,
+    certificate: str | None,
     options: tuple[str, ...],
     json_out: str | None,
     plot_out: str | None,
@@ -92,7 +105,8 @@ def command(
     """Fit a line, plane or hyperplane to the points in FILE, despite its outliers.
 
     FILE is a table with one point a row: CSV text (cells separated by commas, semicolons, tabs or blanks; a header
-    is optional; lines that start with # are skipped) or a 2-D NPY array. "-" reads standard input. The last
+    is optional; lines that start with # are skipped) or a 2-D NPY array. "-" reads standard input; belgian_calls
+    and cyg_ob1 are tables that come with the package. The last
     column is the dependent one: a line takes 2 columns (x, y), a plane 3 (x, y, z), a hyperplane all. The
     residual of a point is measured along the dependent column.
 
@@ -106,11 +120,14 @@ def command(
       maxcon fit calls.csv --model line --threshold 0.2
       maxcon fit stars.csv --model line --threshold 0.5 --columns log_te,log_light --plot stars.png
       maxcon fit points.npy --model plane --threshold 0.1 --method agent --json - | jq .parameters
+      maxcon fit points.npy --model hyperplane --threshold 0.1 --certify --time-limit 5
+      maxcon fit belgian_calls --model line --threshold 0.2 --certificate calls.cert.json
     """
     if json_out == "-" and plot_out == "-":
         raise Failure("--json and --plot cannot both go to standard output")
     chosen = parse_options(options)
     check_options(method, chosen)
+    check_certificate(certificate)
     if json_out is not None:
         check_output(json_out, "--json")
     if plot_out is not None:
@@ -122,7 +139,9 @@ def command(
     names = [table.names[column] for column in used]
     refiner = None if refine == "none" else refine
     with noticed() as interrupted, install_recorder("numba:compile") as compilations:
-        consensus = _fit(problem, threshold, method, seed, time_limit, refiner, gap, chosen)
+        fit = partial(_fit, problem, threshold, method=method, rng=seed, time_limit=time_limit, refine=refiner, gap=gap)
+        consensus = fit(certify=certify or certificate is not None, **chosen)
+        claimed = None if certificate is None else write_proof(certificate, problem, consensus)
 
     about = f"{model.capitalize()} through {Path(table.source).name}"
     if plot_out is not None:
@@ -135,6 +154,8 @@ def command(
         for out in (json_out, plot_out):
             if out is not None:
                 click.echo(f"wrote {out}")
+        if claimed is not None:
+            click.echo(f"wrote {certificate}: {claimed}")
     if interrupted.is_set():
         click.get_current_context().exit(INTERRUPTED)
 
@@ -160,7 +181,7 @@ def check_options(method: str, options: dict[str, Any]) -> None:
     """
     from maxcon.fitting import METHODS  # noqa: PLC0415
 
-    if method not in METHODS:  # "auto", or an error that the fit reports
+    if method not in METHODS:  # an error that the fit reports
         return
     defaults = {name: each.default for name, each in inspect.signature(METHODS[method].load()).parameters.items()}
     kinds = {int: ((int,), "a whole number"), float: ((int, float), "a number"), str: ((str,), "a word")}
@@ -170,16 +191,7 @@ def check_options(method: str, options: dict[str, Any]) -> None:
             raise Failure(f"--option {name} must be {kind}, but it is {value!r}")
 
 
-def _fit(
-    problem: LinearProblem,
-    threshold: float,
-    method: str,
-    seed: int,
-    time_limit: float | None,
-    refine: str | None,
-    gap: int,
-    options: dict[str, Any],
-) -> Consensus:
+def _fit(problem: LinearProblem, threshold: float, **arguments: Any) -> Consensus:
     """Fit, showing on a terminal how far it is."""
     import maxcon  # noqa: PLC0415
 
@@ -189,17 +201,27 @@ def _fit(
             status.update(f"fitting: {progress.n_inliers} inliers found, at most {progress.upper_bound} possible")
 
         with reported():
-            return maxcon.fit(
-                problem,
-                threshold,
-                method=method,
-                rng=seed,
-                time_limit=time_limit,
-                refine=refine,
-                gap=gap,
-                callback=show,
-                **options,
-            )
+            return maxcon.fit(problem, threshold, callback=show, **arguments)
+
+
+def check_certificate(out: str | None) -> None:
+    """Make sure that a certificate can be written there; Failure otherwise."""
+    if out == "-":
+        raise Failure("--certificate must be a file, but it is -")
+    if out is not None:
+        check_output(out, "--certificate")
+
+
+def write_proof(out: str, problem: LinearProblem, consensus: Consensus) -> str:
+    """Write a certificate; return what it claims and proves, in words."""
+    import maxcon  # noqa: PLC0415
+
+    with console(stderr=True).status("writing the certificate ..."), reported():
+        written = maxcon.write_certificate(out, problem, consensus)
+    proven = problem.n_points - sum(group.needed for group in written.groups)
+    if proven <= written.upper_bound:
+        return f"proves that no model has more than {proven} inliers"
+    return f"claims that no model has more than {written.upper_bound} inliers, and proves it for {proven}"
 
 
 def _show(consensus: Consensus, names: list[str], heading: str, refine: str | None, notes: list[str]) -> None:

@@ -25,7 +25,8 @@ def check_output(out: str, option: str, suffixes: tuple[str, ...] = ()) -> None:
         return
     path = Path(out)
     if suffixes and path.suffix.lower() not in suffixes:
-        raise Failure(f"{option} must end in {', '.join(suffixes[:-1])} or {suffixes[-1]}, but it is {out!r}")
+        endings = " or ".join(filter(None, (", ".join(suffixes[:-1]), suffixes[-1])))
+        raise Failure(f"{option} must end in {endings}, but it is {out!r}")
     if path.is_dir():
         raise Failure(f"{option}: {out!r} is a folder, not a file")
     folder = Path(os.path.realpath(path)).parent

@@ -72,7 +72,7 @@ def proof(consensus: Consensus) -> Text:
         return Text(f"no model has more than {consensus.upper_bound} inliers: gap {consensus.gap}", style="yellow")
     if consensus.status == "infeasible":
         return Text("no model explains even one point within the threshold", style="red")
-    return Text("none: this method proves nothing, so another model may have more inliers", style="yellow")
+    return Text("none: nothing is proven, so another model may have more inliers", style="yellow")
 
 
 def equation(model: Sequence[float] | np.ndarray[Any, Any], names: Sequence[str]) -> str:

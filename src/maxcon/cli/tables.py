@@ -8,12 +8,14 @@ import math
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
+from importlib.resources import files
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from maxcon.cli.errors import Failure
+from maxcon.datasets.classic import TABLES
 from maxcon.problem import LinearProblem, hyperplane, line, plane
 
 #: Candidates for what separates the cells of a line; " " stands for any run of blanks.
@@ -66,6 +68,8 @@ class DataTable:
 def read_table(file: str) -> DataTable:
     """Read a CSV or NPY file, told apart by their first bytes; "-" is standard input.
 
+    Where there is no such file, the name may be that of a table in the package (`maxcon.datasets.classic`).
+
     Raises
     ------
     Failure
@@ -75,7 +79,9 @@ def read_table(file: str) -> DataTable:
     try:
         content = sys.stdin.buffer.read() if file == "-" else Path(file).read_bytes()
     except FileNotFoundError:
-        raise Failure(f"there is no file {file!r}") from None
+        if file not in TABLES:
+            raise Failure(f"there is no file {file!r}, and no table of that name: {', '.join(TABLES)}") from None
+        content = (files("maxcon.datasets") / "tables" / f"{file}.csv").read_bytes()
     except IsADirectoryError:
         raise Failure(f"{file!r} is a folder, not a file") from None
     except OSError as error:

@@ -127,8 +127,9 @@ def _show(report: VerificationReport, certificate: Certificate | None, heading: 
     if report.accepted:
         table.add_row("certificate", Text("accepted", style="green"))
         table.add_row("inliers", f"{report.n_inliers} of {report.n_points}, recounted from the model")
+        groups = _counted(report.n_groups, "group", "disjoint groups")
         proven = f"no model has more than {report.proven_bound} inliers"
-        table.add_row("the file proves", f"{proven} ({report.n_bases} bases in {report.n_groups} disjoint groups)")
+        table.add_row("the file proves", f"{proven} ({_counted(report.n_bases, 'basis', 'bases')} in {groups})")
         table.add_row("the claim", _claim(report))
     else:
         table.add_row("certificate", Text("refused", style="red"))
@@ -138,6 +139,10 @@ def _show(report: VerificationReport, certificate: Certificate | None, heading: 
         table.add_row("it is about", f"{certificate.family}, {about}, {duration(certificate.seconds)}")
     table.add_row("time", duration(report.seconds))
     out.print(table)
+
+
+def _counted(number: int, one: str, many: str) -> str:
+    return f"{number} {one if number == 1 else many}"
 
 
 def _claim(report: VerificationReport) -> Text:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import re
 import sys
+import time
 from collections.abc import Callable
 from functools import cache
 from pathlib import Path
@@ -55,11 +56,16 @@ def kernel(function: F) -> F:
 
 
 class _FirstCompilation(event.Listener):  # type: ignore[misc]
-    """Says once, on stderr, why the first call takes long."""
+    """Says once, on stderr, why the first call takes long; keeps the time that compiling takes."""
 
     said = False
+    seconds = 0.0
+
+    def __init__(self) -> None:
+        self._began: list[float] = []
 
     def on_start(self, event: Any) -> None:
+        self._began.append(time.perf_counter())
         dispatcher = event.data.get("dispatcher")
         module = getattr(getattr(dispatcher, "py_func", None), "__module__", "")
         if not self.said and module.startswith("maxcon."):
@@ -70,8 +76,21 @@ class _FirstCompilation(event.Listener):  # type: ignore[misc]
             )
 
     def on_end(self, event: Any) -> None:
-        return
+        began = self._began.pop()
+        if not self._began:  # a kernel that another one calls is part of its compilation
+            self.seconds += time.perf_counter() - began
+
+    def so_far(self) -> float:
+        """Return the seconds of all compilations, with the one that another thread may be at."""
+        began = self._began[:1]
+        return self.seconds + (time.perf_counter() - began[0] if began else 0.0)
 
 
+_compilations = _FirstCompilation()
 if not config.DISABLE_JIT:
-    event.register("numba:compile", _FirstCompilation())
+    event.register("numba:compile", _compilations)
+
+
+def compile_seconds() -> float:
+    """Return how long this process has compiled kernels so far; time limits do not count it."""
+    return _compilations.so_far()

@@ -7,18 +7,22 @@ fit, scaled to at most 1. No input is then badly scaled: years beside an interce
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from weakref import WeakKeyDictionary
 
 import numpy as np
-import scipy.linalg
 from numpy.typing import NDArray
 
+from maxcon.minimax.jit import kernel
 from maxcon.problem import LinearProblem
 
 #: A column whose part orthogonal to the others is smaller than this, relative to its length, has no rank:
 #: the parts of exactly dependent columns come out at up to a few hundred units of rounding.
 RANK_TOLERANCE = 1e-13
+
+#: Residuals smaller than this part of max|b| are not told apart: it is less than the slack of every inlier.
+BELOW_SLACK = 1e-13
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,22 +69,128 @@ def linear_rows(problem: LinearProblem) -> LinearRows:
 def whiten(A: NDArray[np.float64], b: NDArray[np.float64]) -> LinearRows:
     """Return the whitened rows of A, shape (N, d), and b, shape (N,); any N >= 1."""
     n_points, n_params = A.shape
-    sizes = np.abs(A).max(axis=0)  # powers of two: scaling by them is exact
-    sizes = np.where(sizes > 0, np.exp2(np.round(np.log2(np.where(sizes > 0, sizes, 1.0)))), 1.0)
-    lengths = np.sqrt(((A / sizes) ** 2).sum(axis=0))
-    lengths = np.where(lengths > 0, lengths, 1.0) * sizes
-    Q, R, order = scipy.linalg.qr(A / lengths, mode="economic", pivoting=True, check_finite=False)
-    diagonal = np.abs(np.diag(R))
-    rank = int(np.count_nonzero(diagonal > RANK_TOLERANCE * max(diagonal[0], 1e-300)))
-    root = np.sqrt(n_points)
-    At = np.ascontiguousarray(Q[:, :rank].T) * root
+    At, to_model = np.empty((n_params, n_points)), np.zeros((n_params, n_params))
+    origin, rest = np.zeros(n_params), np.empty(n_points)
+    rank, size = _whiten(A, b, At, to_model, origin, rest, np.empty((3, max(n_params, 2), max(n_params, 2))))
+    # Where b is linear in A but for rounding, its rounding is not blown up to order 1.
+    size = max(size, BELOW_SLACK * float(np.abs(b).max()))
+    scale = 2.0 ** math.ceil(math.log2(size)) if size > 1e-300 else 1.0
+    rest /= scale
+    return LinearRows(At[:rank], rest, scale, np.ascontiguousarray(to_model[:, :rank]) * scale, origin)
 
-    to_model = np.zeros((n_params, rank))
-    if rank:
-        to_model[order[:rank]] = scipy.linalg.lapack.dtrtri(R[:rank, :rank])[0]  # R is regular: its diagonal is
-        to_model *= root / lengths[:, None]
-    origin = to_model @ (At @ b) / n_points
-    rest = b - A @ origin
-    size = float(np.abs(rest).max())
-    scale = float(np.exp2(np.ceil(np.log2(size)))) if size > 1e-300 else 1.0
-    return LinearRows(At, np.ascontiguousarray(rest / scale), scale, to_model * scale, origin)
+
+@kernel
+def _whiten(
+    A: NDArray[np.float64],
+    b: NDArray[np.float64],
+    W: NDArray[np.float64],
+    to_model: NDArray[np.float64],
+    origin: NDArray[np.float64],
+    rest: NDArray[np.float64],
+    scratch: NDArray[np.float64],
+) -> tuple[int, float]:
+    """Whiten A into the first rows of W; return the rank and the largest |rest|.
+
+    QR by Gram-Schmidt with column pivoting, every column orthogonalised twice ("twice is enough": Giraud, Langou and
+    Rozloznik 2005), so that the rows of W are orthogonal to rounding.
+    """
+    N, d = A.shape
+    R, inverse, lengths, order = scratch[0], scratch[1], scratch[2, 0], scratch[2, 1]
+    for j in range(d):
+        largest = 0.0
+        for i in range(N):
+            largest = max(largest, abs(A[i, j]))
+        unit = 1.0  # a power of two: scaling by it is exact
+        if largest > 0.0:
+            unit = 2.0 ** float(np.round(np.log2(largest)))
+        for i in range(N):
+            W[j, i] = A[i, j] / unit
+        length = np.sqrt(_dot(W[j], W[j]))
+        lengths[j] = (length if length > 0.0 else 1.0) * unit
+        for i in range(N):
+            W[j, i] = A[i, j] / lengths[j]
+        order[j] = j
+        for k in range(d):
+            R[j, k] = 0.0
+    rank, first = d, 0.0
+    for k in range(d):
+        best, most = k, -1.0
+        for j in range(k, d):
+            square = _dot(W[j], W[j])
+            if square > most:
+                best, most = j, square
+        if best != k:
+            for i in range(N):
+                W[k, i], W[best, i] = W[best, i], W[k, i]
+            order[k], order[best] = order[best], order[k]
+            for i in range(k):
+                R[i, k], R[i, best] = R[i, best], R[i, k]
+        for j in range(k):
+            along = _dot(W[j], W[k])
+            R[j, k] += along
+            _subtract(W[k], along, W[j])
+        size = np.sqrt(_dot(W[k], W[k]))
+        if k == 0:
+            first = size
+        if not size > RANK_TOLERANCE * max(first, 1e-300):
+            rank = k
+            break
+        R[k, k] = size
+        for i in range(N):
+            W[k, i] /= size
+        for j in range(k + 1, d):
+            along = _dot(W[k], W[j])
+            R[k, j] = along
+            _subtract(W[j], along, W[k])
+
+    # to_model = R^-1 with its rows in the order of the columns of A, scaled.
+    root = np.sqrt(float(N))
+    for k in range(rank):
+        for j in range(rank):
+            inverse[j, k] = 0.0
+        inverse[k, k] = 1.0 / R[k, k]
+        for j in range(k - 1, -1, -1):
+            total = 0.0
+            for i in range(j + 1, k + 1):
+                total += R[j, i] * inverse[i, k]
+            inverse[j, k] = -total / R[j, j]
+    for j in range(rank):
+        column = int(order[j])
+        for k in range(rank):
+            to_model[column, k] = inverse[j, k] * root / lengths[column]
+    for k in range(rank):
+        along = _dot(W[k], b)
+        for i in range(N):
+            W[k, i] *= root
+        for j in range(d):
+            origin[j] += to_model[j, k] * along / root
+    largest = 0.0
+    for i in range(N):
+        total = b[i]
+        for j in range(d):
+            total -= A[i, j] * origin[j]
+        rest[i] = total
+        largest = max(largest, abs(total))
+    return rank, largest
+
+
+@kernel
+def _dot(x: NDArray[np.float64], y: NDArray[np.float64]) -> float:
+    """Return x . y, in four sums side by side: faster than one, and more accurate."""
+    n = x.shape[0]
+    s0 = s1 = s2 = s3 = 0.0
+    for i in range(0, n - 3, 4):
+        s0 += x[i] * y[i]
+        s1 += x[i + 1] * y[i + 1]
+        s2 += x[i + 2] * y[i + 2]
+        s3 += x[i + 3] * y[i + 3]
+    for i in range(n - n % 4, n):
+        s0 += x[i] * y[i]
+    return (s0 + s1) + (s2 + s3)
+
+
+@kernel
+def _subtract(x: NDArray[np.float64], factor: float, y: NDArray[np.float64]) -> None:
+    """Subtract a multiple of y from x."""
+    for i in range(x.shape[0]):
+        x[i] -= factor * y[i]

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from maxcon.minimax import LinearRows, linear_rows
+from maxcon.minimax.jit import compile_seconds
 from maxcon.problem import LinearProblem, inlier_slack
 
 
@@ -61,11 +62,14 @@ class Step:
         The points removed to reach `subset`, in order, where the method removes points one by one.
     upper_bound
         A proven upper bound on the consensus.
+    refined
+        The method has refined `subset` itself, or finds the optimum without; it is taken as it is.
     """
 
     subset: NDArray[np.bool_] | None = None
     path: NDArray[np.int64] | None = None
     upper_bound: int | None = None
+    refined: bool = False
 
 
 class Method(Protocol):
@@ -117,8 +121,9 @@ def make_task(
     gap: int = 0,
 ) -> Task:
     """Return the task for `problem`: whitened rows, the limit on gamma in their unit, the deadline."""
-    deadline = np.inf if time_limit is None else time.perf_counter() + time_limit
+    began, compiled = time.perf_counter(), compile_seconds()
     rows = linear_rows(problem)
+    deadline = np.inf if time_limit is None else began + time_limit + compile_seconds() - compiled
     limit = (threshold + inlier_slack(threshold, problem.scale)) / rows.scale
     return Task(problem, rows, threshold, limit, rng, deadline, gap)
 
@@ -129,8 +134,11 @@ def run(
     refine: Refiner | None = None,
     callback: Callable[[Progress], object] | None = None,
 ) -> Best:
-    """Drive `steps` to its end, or until the gap, the deadline, the callback (a true value) or Ctrl-C stops it."""
-    began = time.perf_counter()
+    """Drive `steps` to its end, or until the gap, the deadline, the callback (a true value) or Ctrl-C stops it.
+
+    Kernels that are compiled on the way, once on a machine, do not count against the deadline.
+    """
+    began, compiled = time.perf_counter(), compile_seconds()
     best = Best(upper_bound=task.problem.n_points)
     try:
         for step in steps:
@@ -138,7 +146,7 @@ def run(
             if step.upper_bound is not None and step.upper_bound < best.upper_bound:
                 best.upper_bound, news = step.upper_bound, True
             if step.subset is not None:
-                subset = step.subset if refine is None else refine(task, step.subset)
+                subset = step.subset if refine is None or step.refined else refine(task, step.subset)
                 size = int(np.count_nonzero(subset))
                 if best.subset is None or size > best.size:
                     best.subset, best.size, news = subset, size, True
@@ -147,7 +155,9 @@ def run(
             now = time.perf_counter()
             if callback is not None and news and callback(Progress(best.size, best.upper_bound, now - began)):
                 break
-            if (best.subset is not None and best.gap <= task.gap) or now >= task.deadline:
+            if best.subset is not None and best.gap <= task.gap:
+                break
+            if now >= task.deadline and now >= task.deadline + compile_seconds() - compiled:
                 break
     except KeyboardInterrupt:
         best.interrupted = True

@@ -38,7 +38,7 @@ def propose(task: Task) -> Iterator[Step]:
             subset = swap_refinement(task, step.subset)
             if np.count_nonzero(subset) > size:
                 size = int(np.count_nonzero(subset))
-                yield Step(subset=subset)
+                yield Step(subset=subset, refined=True)
             else:
                 yield Step()
 

@@ -180,7 +180,7 @@ class _Search:
             if self.best > shown:
                 shown = self.best
                 subset = self._subset()
-            yield Step(subset=subset, upper_bound=self.upper_bound)
+            yield Step(subset=subset, upper_bound=self.upper_bound, refined=True)
 
     def _stab(self) -> Step:
         """Solve a problem with one parameter."""
