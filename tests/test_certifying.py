@@ -157,14 +157,14 @@ def test_certificate_file(tmp_path):
     path = tmp_path / "fit.cert.json"
     problem = synthetic_hyperplane(np.random.default_rng(0), 80, 0.2, 4)
     result = maxcon.fit(problem, 0.1, method="exact")
-    written = maxcon.write_certificate(path, problem, result)
+    written = maxcon.write_certificate(path, result)
     report = verify(load(path), problem.A, problem.b)
     assert report.accepted
     assert report.n_inliers == result.n_inliers
     assert report.claimed_bound == written.upper_bound == result.upper_bound
     assert result.upper_bound <= report.proven_bound < 80
     hopeless = maxcon.LinearProblem(np.zeros((3, 2)), [3.0, 4.0, 5.0])
-    maxcon.write_certificate(path, hopeless, maxcon.fit(hopeless, 0.1))
+    maxcon.write_certificate(path, maxcon.fit(hopeless, 0.1))
     assert verify(load(path), hopeless.A, hopeless.b).accepted
 
 
@@ -176,7 +176,8 @@ def test_certificate_file(tmp_path):
             ValueError,
             r"model_or_mask must have shape \(2,\), but its shape is \(3,\)",
         ),
-        ({"model_or_mask": np.zeros(20)}, ValueError, "model_or_mask must be of dtype bool if it is a mask"),
+        ({"model_or_mask": np.full(20, 0.5)}, ValueError, "model_or_mask must hold 0 and 1 only if it is a mask"),
+        ({"model_or_mask": [3, 5, 8]}, ValueError, "of indices, make a mask"),
         ({"model_or_mask": np.zeros(20, dtype=bool)}, ValueError, "model_or_mask must"),
         ({"model_or_mask": np.ones(19, dtype=bool)}, ValueError, r"model_or_mask must have shape \(20,\)"),
         ({"model_or_mask": "best"}, TypeError, "model_or_mask must hold real numbers"),
@@ -195,5 +196,68 @@ def test_wrong_arguments(arguments, error, message):
         maxcon.certify(**arguments)
     with pytest.raises(TypeError, match="certify must be True or False"):
         maxcon.fit(problem, 0.1, certify=1)
+    with pytest.raises(TypeError, match="consensus must be a Consensus"):
+        maxcon.write_certificate("x", None)
     with pytest.raises(ValueError, match="time_limit must be"):
-        maxcon.write_certificate("x", problem, None, time_limit=-1)
+        maxcon.write_certificate("x", None, time_limit=-1)
+
+
+def test_results_of_other_origin_as_their_makers_give_them():
+    problem = synthetic_hyperplane(np.random.default_rng(0), 40, 0.3, 2)
+    best = maxcon.fit(problem, 0.1)
+    mask = best.inlier_mask
+    for given in (best, mask, mask.astype(np.uint8), mask.astype(np.uint8)[:, None], mask.tolist()):
+        assert maxcon.certify(problem, 0.1, given).n_inliers == best.n_inliers
+    two = np.zeros(40, dtype=bool)
+    two[:2] = True
+    assert maxcon.certify(problem, 1e-9, two).n_inliers >= 1
+
+
+def test_a_refuted_bound_proves_nothing():
+    """Rows on which rounding is larger than the threshold: a model explains what was 'proven' impossible."""
+    i = np.arange(12.0)
+    problem = maxcon.LinearProblem(np.column_stack([2.0**52 + 64 * i, 2.0**51 + 32 * i, i]), i)
+    given = maxcon.certify(problem, 0.25, [0.0, 0.0, 1.0])
+    assert given.n_inliers == 12
+    assert given.upper_bound == 12
+
+
+def test_time_stamps_lose_nothing_to_their_offset():
+    stamps, values = 1.7e18 + 1024 * np.arange(40.0), np.arange(40.0)
+    result = maxcon.fit(maxcon.line(stamps, values), 0.25)
+    assert (result.n_inliers, result.status) == (40, "optimal")
+
+
+def test_columns_that_only_nearly_depend_on_each_other_prove_nothing():
+    stamps = 1.7e18 + 1024 * np.arange(40.0)
+    A = np.column_stack([stamps, 2 * stamps + 1e3 * np.arange(40.0) ** 2])
+    values = np.arange(40.0) ** 2
+    result = maxcon.fit(maxcon.LinearProblem(A, values), 0.25)
+    assert result.status == "heuristic"
+    exactly = maxcon.fit(maxcon.LinearProblem(np.column_stack([stamps, 2 * stamps]), values), 0.25)
+    assert exactly.status == "optimal"
+
+
+def test_repeated_readings_that_differ_by_just_the_threshold():
+    rng = np.random.default_rng(0)
+    x, y = rng.normal(size=(2, 4)).repeat(3, axis=1)
+    z = np.float32(0.1 * rng.integers(-3, 4, 12)).astype(float)
+    result = maxcon.fit(maxcon.plane(x, y, z), 0.05, time_limit=20)
+    assert (result.n_inliers, result.status) == (
+        brute_force_consensus(np.column_stack([x, y, np.ones(12)]), z, 0.05),
+        "optimal",
+    )
+
+
+def test_tiny_numbers_are_proven_too():
+    y = np.array([0, 1, 2, 3, 9, -4.0]) * 1e-150
+    result = maxcon.fit(maxcon.line(np.arange(6.0), y), 1e-151)
+    assert (result.n_inliers, result.status) == (4, "optimal")
+
+
+def test_what_is_of_another_problem_is_refused():
+    x = np.arange(12.0)
+    result = maxcon.fit(maxcon.line(x, x), 0.1)
+    other = maxcon.line(x, np.r_[x[:3], 50 * np.sin(x[3:])])
+    with pytest.raises(ValueError, match="of other data"):
+        maxcon.alternative_optima(other, 0.1, result)

@@ -12,18 +12,19 @@ from numpy.typing import ArrayLike, NDArray
 from maxcon.certification import Certificate, issue, save
 from maxcon.minimax import minimax_fit
 from maxcon.problem import Consensus, LinearProblem, check_indices, check_model, check_threshold, inlier_slack
-from maxcon.problem.validate import check_number
+from maxcon.problem.validate import check_callback, check_gap, check_time_limit
 from maxcon.search.anytime import Progress, Task, make_task, run
 from maxcon.search.conclusion import judge
 from maxcon.search.proof import prove
-from maxcon.search.proposal import best_proposal
+from maxcon.search.proposal import propose
+from maxcon.search.refine import swap_refinement
 from maxcon.search.witness import make_witness
 
 
 def certify(
     problem: LinearProblem,
     threshold: float,
-    model_or_mask: ArrayLike,
+    model_or_mask: ArrayLike | Consensus,
     *,
     time_limit: float | None = None,
     gap: int = 0,
@@ -38,8 +39,9 @@ def certify(
     threshold
         The largest residual of an inlier, in the unit of b.
     model_or_mask
-        The result: a model, shape (d,), whose inliers are counted as they are; or its inliers, bool of shape (N,), of
-        which as many count as one model explains (their minimax fit, if that is within the threshold).
+        The result: a model, shape (d,), whose inliers are counted as they are; or a `Consensus`, for its model; or
+        inliers, of shape (N,) or (N, 1), bool or 0 and 1, of which as many count as one model explains (their minimax
+        fit, if that is within the threshold).
     time_limit
         Seconds after which the bound proven so far is returned; None for no limit, which can take long where there are
         many outliers and more than three parameters.
@@ -64,38 +66,29 @@ def certify(
     if not isinstance(problem, LinearProblem):
         raise TypeError(f"problem must be a LinearProblem, but it is a {type(problem).__name__}")
     threshold = check_threshold(threshold)
-    if time_limit is not None and not check_number(time_limit, "time_limit") > 0:
-        raise ValueError(f"time_limit must be a positive number of seconds or None, but it is {time_limit}")
-    if isinstance(gap, bool) or not isinstance(gap, (int, np.integer)):
-        raise TypeError(f"gap must be a whole number, but it is {gap!r}")
-    if gap < 0:
-        raise ValueError(f"gap must be at least 0, but it is {gap}")
-    if callback is not None and not callable(callback):
-        raise TypeError(f"callback must be callable, but it is a {type(callback).__name__}")
+    check_time_limit(time_limit)
+    gap = check_gap(gap)
+    check_callback(callback)
     task = make_task(problem, threshold, np.random.default_rng(0), time_limit)
     model = _model(task, model_or_mask)
-    n_given = int(np.count_nonzero(problem.residuals(model) <= _limit(problem, threshold)))
+    known = problem.residuals(model) <= _limit(problem, threshold)
+    n_given = int(np.count_nonzero(known))
 
     def stop(progress: Progress) -> bool:
         asked = callback is not None and bool(callback(progress))
         return asked or progress.upper_bound - n_given <= gap
 
-    known = problem.residuals(model) <= _limit(problem, threshold)
     best = run(task, prove(task, known), None, stop)
-    return judge(task, model, max(best.upper_bound, n_given), time.perf_counter() - began)
+    return judge(task, model, best.upper_bound, time.perf_counter() - began)
 
 
-def write_certificate(
-    path: str | Path, problem: LinearProblem, consensus: Consensus, *, time_limit: float | None = 10.0
-) -> Certificate:
+def write_certificate(path: str | Path, consensus: Consensus, *, time_limit: float | None = 10.0) -> Certificate:
     """Write a certificate of a result: a file that `maxcon verify` checks without trusting the search.
 
     Parameters
     ----------
     path
         Where to write it; JSON.
-    problem
-        What was fitted.
     consensus
         The result of `maxcon.fit` or `maxcon.certify`. Its upper bound is the claim.
     time_limit
@@ -113,9 +106,10 @@ def write_certificate(
     TypeError, ValueError
         If an argument has the wrong type or range.
     """
-    if time_limit is not None and not check_number(time_limit, "time_limit") > 0:
-        raise ValueError(f"time_limit must be a positive number of seconds or None, but it is {time_limit}")
-    witness = None
+    check_time_limit(time_limit)
+    if not isinstance(consensus, Consensus):
+        raise TypeError(f"consensus must be a Consensus, but it is a {type(consensus).__name__}")
+    problem, witness = consensus.problem, None
     if consensus.n_inliers > 0:
         task = make_task(problem, consensus.threshold, np.random.default_rng(0), time_limit)
         witness = make_witness(task, consensus.inlier_mask, enough=consensus.upper_bound)
@@ -128,18 +122,30 @@ def _limit(problem: LinearProblem, threshold: float) -> float:
     return threshold + inlier_slack(threshold, problem.scale)
 
 
-def _model(task: Task, model_or_mask: ArrayLike) -> NDArray[np.float64]:
+def _model(task: Task, model_or_mask: ArrayLike | Consensus) -> NDArray[np.float64]:
     """Return the model given, or the minimax fit of the set given, or of the largest part of it found that has one."""
-    given = np.asarray(model_or_mask)
     problem = task.problem
+    given = np.asarray(model_or_mask.model if isinstance(model_or_mask, Consensus) else model_or_mask)
+    N = problem.n_points
+    if given.dtype != np.bool_ and given.shape in ((N,), (N, 1)) and given.shape != (problem.n_params,):
+        if not np.isin(given, (0, 1)).all():
+            raise ValueError("model_or_mask must hold 0 and 1 only if it is a mask, but it holds other numbers")
+        given = given == 1
     if given.dtype != np.bool_:
-        if given.shape == (problem.n_points,) and problem.n_points != problem.n_params:
-            raise ValueError("model_or_mask must be of dtype bool if it is a mask, but it is " + str(given.dtype))
+        if given.dtype.kind in "iu" and given.shape != (problem.n_params,):
+            raise ValueError(
+                f"model_or_mask must be a model of shape ({problem.n_params},) or a mask of shape ({N},), but its "
+                f"shape is {given.shape}; of indices, make a mask: numpy.zeros({N}, bool), True at the indices"
+            )
         return check_model(given, problem.n_params, "model_or_mask")
-    mask = check_indices(given, problem.n_points, "model_or_mask")
+    mask = check_indices(given.reshape(-1) if given.shape == (N, 1) else given, N, "model_or_mask")
     fit = minimax_fit(problem, mask)
-    if fit.value <= _limit(problem, task.threshold):
+    limit = _limit(problem, task.threshold)
+    if fit.value <= limit:
         return fit.model
-    part = LinearProblem(problem.A[mask], problem.b[mask])
-    chosen = best_proposal(make_task(part, task.threshold, np.random.default_rng(0)))
-    return minimax_fit(part, chosen).model if chosen.any() else fit.model
+    # The points outside the set are made such that no model explains them.
+    part = LinearProblem(problem.A * mask[:, None], np.where(mask, problem.b, 2.0 * limit))
+    seconds = task.seconds_left() / 2 if task.deadline < np.inf else None
+    inner = make_task(part, task.threshold, np.random.default_rng(0), seconds)
+    best = run(inner, propose(inner), swap_refinement)
+    return fit.model if best.subset is None else minimax_fit(problem, best.subset).model

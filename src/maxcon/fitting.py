@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from maxcon.problem import Consensus, LinearProblem, check_threshold
-from maxcon.problem.validate import check_number
+from maxcon.problem.validate import check_callback, check_gap, check_time_limit
 from maxcon.search.anytime import Method, Progress, Refiner, make_task, run
 from maxcon.search.conclusion import conclude
 from maxcon.search.proof import then_prove
@@ -70,6 +70,14 @@ METHODS: dict[str, MethodEntry] = {
         "maxcon.search.peel:peel",
         "from a good model, removes the basis point that it explains worst, until the rest fits",
     ),
+    "learned": MethodEntry(
+        "maxcon.search.learned:learned",
+        "proposals from a belief, walks down the tree by a small network, a belief that learns; until the time is over",
+    ),
+    "uclm": MethodEntry(
+        "maxcon.search.uclm:uclm",
+        "weights from one pass of a network, models from the weights (Probst et al. 2019)",
+    ),
     "sweep": MethodEntry(
         "maxcon.search.sweep:exact_sweep", "the proven optimum, d = 2: sweeps the arrangement of lines"
     ),
@@ -85,6 +93,9 @@ METHODS: dict[str, MethodEntry] = {
     ),
     "milp": MethodEntry("maxcon.search.milp:milp", "the proven optimum by big-M integer programming (HiGHS)"),
 }
+
+#: Methods that end with a proof, if they end; they need no other search after them.
+PROVING = ("auto", "exact")
 
 REFINERS: dict[str, str] = {
     "tree": "maxcon.search.refine:tree_refinement",
@@ -151,21 +162,19 @@ def fit(
         raise TypeError(f"problem must be a LinearProblem, but it is a {type(problem).__name__}")
     threshold = check_threshold(threshold)
     generator, seed = _check_rng(rng)
-    _check_time_limit(time_limit)
-    if isinstance(gap, bool) or not isinstance(gap, (int, np.integer)):
-        raise TypeError(f"gap must be a whole number, but it is {gap!r}")
-    if gap < 0:
-        raise ValueError(f"gap must be at least 0, but it is {gap}")
-    if callback is not None and not callable(callback):
-        raise TypeError(f"callback must be callable, but it is a {type(callback).__name__}")
+    check_time_limit(time_limit)
+    gap = check_gap(gap)
+    check_callback(callback)
     refiner = _check_refine(refine)
     if not isinstance(certify, bool):
         raise TypeError(f"certify must be True or False, but it is {certify!r}")
     function = METHODS[_check_method(method)].load()
     _check_options(method, function, options)
 
-    task = make_task(problem, threshold, generator, time_limit, int(gap))
-    steps = then_prove(task, function, options) if certify else function(task, **options)
+    task = make_task(problem, threshold, generator, time_limit, gap)
+    if certify and method == "auto":  # whose time goes to a proof anyway
+        function = METHODS["exact"].load()
+    steps = then_prove(task, function, options) if certify and method not in PROVING else function(task, **options)
     best = run(task, steps, refiner, callback)
     result = conclude(task, best, method, seed, 0.0)
     return replace(result, seconds=time.perf_counter() - began)
@@ -186,11 +195,6 @@ def _check_rng(rng: Any) -> tuple[np.random.Generator, int | None]:
     if rng < 0:
         raise ValueError(f"rng must be a seed of at least 0, but it is {rng}")
     return np.random.default_rng(int(rng)), int(rng)
-
-
-def _check_time_limit(time_limit: Any) -> None:
-    if time_limit is not None and not check_number(time_limit, "time_limit") > 0:
-        raise ValueError(f"time_limit must be a positive number of seconds or None, but it is {time_limit}")
 
 
 def _check_refine(refine: Any) -> Refiner | None:

@@ -6,14 +6,16 @@ import torch
 
 import maxcon
 from maxcon.agent.config import paper, shipped
-from maxcon.agent.graph import batched_neighbour_max, neighbour_graph, neighbour_max, scatter_gradient
+from maxcon.agent.graph import batched_neighbour_max, neighbour_graph, neighbour_max, point_features, scatter_gradient
 from maxcon.agent.inference import Agent, pack, q_values
 from maxcon.agent.network import QNetwork
-from maxcon.agent.shipped import agent_names, agent_path, model_card, shipped_agent
+from maxcon.agent.shipped import agent_file, agent_names, agent_path, model_card, shipped_agent
 from maxcon.agent.weights import load_weights, save_weights
 from maxcon.datasets.synthetic import synthetic_hyperplane
+from maxcon.datasets.two_view_scene import synthetic_two_view
 from maxcon.tree import root
 from maxcon.tree.encoding import canonical_features, raw_features
+from maxcon.vision.fundamental import fundamental_problem
 
 
 def random_network(config, n_features, seed):
@@ -38,6 +40,7 @@ def states(problem, rng, channels):
     [
         (2, 100, {}),
         (3, 60, {}),
+        (4, 50, {"estimate": True}),
         (2, 7, {}),  # fewer points than neighbours
         (4, 150, {"widths": (16, 24), "head": (8,), "global_width": 12}),
         (2, 50, {"widths": (5, 7, 9), "head": (6, 5, 4), "global_width": 3, "neighbours": 4}),
@@ -47,13 +50,13 @@ def test_compiled_equals_torch(n_params, n_points, changes):
     rng = np.random.default_rng(n_points)
     for base in (shipped, paper):
         config = base(n_params).override(**changes)
-        network = random_network(config, n_params, n_points)
+        network = random_network(config, n_params + config.network.estimate, n_points)
         tensors = {name: value.detach().numpy() for name, value in network.state_dict().items()}
         agent = Agent(config, pack(tensors, config))
         problem = synthetic_hyperplane(rng, n_points, 0.4, n_params)
-        H = canonical_features(problem) if config.network.canonical else raw_features(problem)
+        H = point_features(problem, 0.1, config.network)
         graph = neighbour_graph(H, config.network.neighbours)
-        scratch = agent.prepare(problem)
+        scratch = agent.prepare(problem, 0.1)
         found = np.empty(n_params + 1)
         n_states = 0
         for channels, basis in states(problem, rng, config.network.channels):
@@ -68,29 +71,66 @@ def test_compiled_equals_torch(n_params, n_points, changes):
         assert n_states > 0
 
 
+def test_the_features_of_a_problem():
+    problem = synthetic_hyperplane(np.random.default_rng(5), 40, 0.3, 2)
+    raw, canonical = (base(2).network for base in (paper, shipped))
+    assert np.array_equal(point_features(problem, 0.1, raw), raw_features(problem))
+    assert np.array_equal(point_features(problem, 0.1, canonical), canonical_features(problem))
+    features = point_features(problem, 0.2, shipped(2).override(estimate=True).network)
+    assert np.array_equal(features[:, :-1], canonical_features(problem))
+    signed = features[:, -1].astype(float)
+    assert np.allclose(0.2 * signed / (1 - np.abs(signed)), problem.b, rtol=1e-5)
+    scaled = maxcon.LinearProblem(problem.A, 7.0 * problem.b)  # in another unit
+    assert np.allclose(point_features(scaled, 1.4, shipped(2).override(estimate=True).network), features, atol=1e-5)
+
+
+def problem_for(name, rng):
+    """Return a problem of the kind that a shipped agent is for."""
+    if name.startswith("fundamental"):
+        scene = synthetic_two_view(100, 0.3, rng)
+        return fundamental_problem(scene.x1, scene.x2, threshold=0.1).problem
+    return synthetic_hyperplane(rng, 100, 0.5, {"line": 2, "plane": 3}[name])
+
+
 def test_shipped_agents_equal_torch_to_1e_5():
-    for name, n_params in (("line", 2), ("plane", 3)):
-        assert name in agent_names()
-        problem = synthetic_hyperplane(np.random.default_rng(1), 100, 0.5, n_params)
-        agent = shipped_agent(problem)
-        network = QNetwork(n_params, agent.config.network)
+    assert {"line", "plane", "fundamental", "fundamental-paper"} <= set(agent_names())
+    for name in agent_names():
+        problem = problem_for(name, np.random.default_rng(1))
+        agent = Agent.load(agent_file(name))
+        H = point_features(problem, 0.1, agent.config.network)
+        network = QNetwork(H.shape[1], agent.config.network)
         tensors, _ = load_weights(agent_path(name))
         network.load_state_dict({key: torch.from_numpy(value) for key, value in tensors.items()})
-        H = canonical_features(problem)
         graph = neighbour_graph(H, agent.config.network.neighbours)
-        scratch = agent.prepare(problem)
-        found = np.empty(n_params + 1)
+        scratch = agent.prepare(problem, 0.1)
+        found = np.empty(problem.n_params + 1)
         for channels, basis in states(problem, np.random.default_rng(2), agent.config.network.channels):
             q_values(agent.parameters, scratch, channels, basis, found)
             with torch.no_grad():
                 expected = network(*(torch.from_numpy(each)[None] for each in (H, graph, channels, basis)))[0].numpy()
-            assert np.abs(found - expected).max() <= 1e-5
+            # Q-values of d = 8 reach some -5: float32 keeps about seven digits of them
+            assert np.abs(found - expected).max() <= 1e-5 * max(1.0, float(np.abs(expected[basis >= 0]).max()))
+
+
+def test_the_family_chooses_the_agent(tmp_path, monkeypatch):
+    scene = synthetic_two_view(40, 0.3, np.random.default_rng(0))
+    for name in ("line", "plane", "fundamental"):
+        problem = problem_for(name, np.random.default_rng(0))
+        assert shipped_agent(problem).config == load_weights(agent_path(name))[1]
+    posed = fundamental_problem(scene.x1, scene.x2, threshold=0.1)
+    assert maxcon.fit(posed.problem, 0.1, method="agent", weights="fundamental-paper").n_inliers > 8
+    other = fundamental_problem(scene.x1, scene.x2, chart="F32=1").problem
+    with pytest.raises(ValueError, match="families fundamental, line, plane, but the problem is of the family 'fundam"):
+        maxcon.fit(other, 0.1, method="agent")
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "line").write_bytes(agent_path("plane").read_bytes())  # a file goes before a name
+    assert Agent.load(agent_file("line")).config.train.n_params == 3
 
 
 def test_model_cards_name_their_command_and_seed():
     for name in agent_names():
         card = model_card(name)
-        for word in ("seed", f"maxcon train {name}", "held-out"):
+        for word in ("seed", f"maxcon train {name.partition('-')[0]}", "held-out"):
             assert word in card, (name, word)
     with pytest.raises(ValueError, match="name must be one of"):
         model_card("circle")
@@ -106,9 +146,9 @@ def test_q_does_not_depend_on_the_order_of_the_points():
     order = rng.permutation(80)
     shuffled = maxcon.LinearProblem(problem.A[order], problem.b[order])
     first, second = np.empty(3), np.empty(3)
-    q_values(agent.parameters, agent.prepare(problem), np.ascontiguousarray(channels), basis, first)
+    q_values(agent.parameters, agent.prepare(problem, 0.1), np.ascontiguousarray(channels), basis, first)
     where = np.argsort(order)[basis]
-    q_values(agent.parameters, agent.prepare(shuffled), np.ascontiguousarray(channels[order]), where, second)
+    q_values(agent.parameters, agent.prepare(shuffled, 0.1), np.ascontiguousarray(channels[order]), where, second)
     assert np.abs(first - second).max() < 1e-4
 
 
@@ -124,7 +164,7 @@ def test_canonical_agents_do_not_see_units():
     for state in (first, second):
         q = np.empty(3)
         channels = np.ascontiguousarray(state.encode(config.network.channels)[:, -5:])
-        q_values(agent.parameters, agent.prepare(state.problem), channels, state.basis, q)
+        q_values(agent.parameters, agent.prepare(state.problem, 0.1), channels, state.basis, q)
         found.append(q)
     assert np.allclose(*found, atol=1e-4)
 
@@ -134,7 +174,7 @@ def test_an_agent_for_another_number_of_columns_is_refused():
     network = random_network(config, 2, 0)
     agent = Agent(config, pack({k: v.detach().numpy() for k, v in network.state_dict().items()}, config))
     with pytest.raises(ValueError, match="problem must have 1 columns that vary"):
-        agent.prepare(synthetic_hyperplane(np.random.default_rng(0), 30, 0.3, 3))
+        agent.prepare(synthetic_hyperplane(np.random.default_rng(0), 30, 0.3, 3), 0.1)
 
 
 def test_weights_survive_the_file(tmp_path):
@@ -194,5 +234,5 @@ def test_shipped_agents_are_what_their_command_makes():
         state = root(problem, 0.1)
         q = np.empty(n_params + 1)
         channels = np.ascontiguousarray(state.encode(agent.config.network.channels)[:, -5:])
-        q_values(agent.parameters, agent.prepare(problem), channels, state.basis, q)
+        q_values(agent.parameters, agent.prepare(problem, 0.1), channels, state.basis, q)
         assert np.allclose(q, expected[name], atol=2e-3), q

@@ -10,7 +10,7 @@ import torch
 
 from maxcon.agent.config import AgentConfig, paper, shipped
 from maxcon.agent.learn import Learner, prepare
-from maxcon.agent.train import HeldOut, held_out_gap, load_checkpoint, save_checkpoint, train
+from maxcon.agent.train import HeldOut, begin_with, held_out_gap, load_checkpoint, save_checkpoint, train
 from maxcon.datasets.synthetic import mixed_rates, synthetic_hyperplane
 
 SMALL = {
@@ -204,6 +204,34 @@ def test_a_folder_of_another_run_is_refused(tmp_path):
     other = small(updates=10, seed=1)
     with pytest.raises(ValueError, match="folder holds a run with another configuration"):
         train(other, make_data(other), make_held_out(other), tmp_path, progress=False)
+
+
+def test_a_run_begins_with_the_weights_it_is_given(tmp_path):
+    config = small(updates=20)
+    data, held_out = make_data(config), make_held_out(config)
+    first = train(config, data, held_out, tmp_path / "first", progress=False)
+    weights = tmp_path / "first" / "agent.safetensors"
+    learner = Learner(data, small(seed=3))
+    begin_with(learner, weights)
+    for network in (learner.network, learner.target):
+        for name, value in network.state_dict().items():
+            assert torch.equal(value, first.network.state_dict()[name]), name
+    for other, message in ((small(widths=(8, 9)), "start must hold a network of"), (small(), "for d = 3")):
+        problems = [synthetic_hyperplane(np.random.default_rng(0), 24, 0.3, 3)] if "d = 3" in message else None
+        instances = prepare(problems, 0.1, other) if problems else make_data(other)
+        with pytest.raises(ValueError, match=message):
+            begin_with(Learner(instances, other.override(n_params=3) if problems else other), weights)
+
+
+def test_older_configurations_are_read():
+    """Those of the agents shipped first have no data section and do not know the estimate."""
+    config = shipped(2)
+    values = json.loads(json.dumps(config.to_dict()))
+    del values["data"], values["network"]["estimate"]
+    assert AgentConfig.from_dict(values) == config
+    del values["network"]["canonical"]
+    with pytest.raises(ValueError, match="values must have the settings"):
+        AgentConfig.from_dict(values)
 
 
 def test_configurations_survive_json_and_refuse_unknown_settings():

@@ -59,13 +59,15 @@ def test_agents_json(run, cards):
     record = json.loads(run("agents", "--json").stdout)
     assert [each["name"] for each in record] == list(agent_names())
     for each in record:
-        assert each["config"]["train"]["n_params"] in (2, 3)
+        d = {"line": 2, "plane": 3, "fundamental": 8}[each["name"].partition("-")[0]]
+        assert each["config"]["train"]["n_params"] == d
         assert each["bytes"] > 10_000
     assert [each["name"] for each in json.loads(run("agents", "plane", "--json").stdout)] == ["plane"]
 
 
 def test_unknown_agent(fails):
-    assert "name must be one of line, plane, but it is 'circle'" in fails("agents", "circle")
+    names = "fundamental, fundamental-paper, line, plane"
+    assert f"name must be one of {names}, but it is 'circle'" in fails("agents", "circle")
 
 
 def test_no_agents(run, monkeypatch):

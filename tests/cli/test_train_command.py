@@ -1,4 +1,5 @@
 import builtins
+import hashlib
 import importlib.util
 import json
 import os
@@ -22,6 +23,7 @@ TINY = ("--set", "n_points=12", "--set", "n_instances=20", "--set", "widths=8,8"
 @pytest.fixture(autouse=True)
 def few_held_out(monkeypatch):
     monkeypatch.setattr("maxcon.experiments.training.HELD_OUT_EACH", 2)
+    monkeypatch.setattr("maxcon.experiments.training.TWO_VIEW_EACH", 1)
 
 
 def test_settings():
@@ -120,6 +122,62 @@ def test_the_papers_agent(run, monkeypatch):
     assert run("train", "plane", "--paper", "--seed", 2).exit_code == 130
     assert seen == [paper(3, 2)]
     assert os.listdir("runs") == ["plane-paper-seed2"]
+
+
+def test_fundamental_matrices_and_fine_tuning(run, tmp_path):
+    small = (*TINY, "--set", "n_points=20")
+    first = run("train", "fundamental", "--updates", 20, *small, "--out", "first")
+    assert first.exit_code == 0, first.output
+    assert "training an agent for fundamental matrices: 20 updates" in first.stderr
+    assert "fundamental, N = 20, 1 held-out instances a rate" in first.stdout
+    before = json.loads((tmp_path / "first" / "config.json").read_text(encoding="utf-8"))
+    assert (before["data"]["source"], before["data"]["chart"], before["network"]["estimate"]) == ("scene", "auto", True)
+
+    weights = "first/agent.safetensors"
+    tuned = run("train", "fundamental", "--from", weights, "--updates", 8, "--out", "tuned")
+    assert tuned.exit_code == 0, tuned.output
+    after = json.loads((tmp_path / "tuned" / "config.json").read_text(encoding="utf-8"))
+    assert after["network"] == before["network"]
+    assert (after["train"]["learning_rate"], after["train"]["updates"]) == (2e-4, 8)
+    assert after["data"]["started_from"] == hashlib.sha256((tmp_path / weights).read_bytes()).hexdigest()
+    one, other = load_file(weights), load_file("tuned/agent.safetensors")
+    moved = max(float(np.abs(value - other[name]).max()) for name, value in one.items())
+    assert 0 < moved < 8 * 2e-4 * 10  # Adam's steps are about as large as the learning rate
+
+    half = run("train", "fundamental", "--from", weights, "--updates", 8, "--minutes", 1e-9, "--out", "half")
+    assert half.exit_code == 0, half.output
+    assert f"go on with: maxcon train fundamental --from {weights} --out half" in half.stdout
+    rest = run("train", "fundamental", "--from", weights, "--out", "half")
+    assert rest.exit_code == 0, rest.output
+    for name, value in load_file("half/agent.safetensors").items():
+        np.testing.assert_array_equal(value, other[name])
+    (tmp_path / "half" / "checkpoint.pt").unlink()  # as after a kill before the first checkpoint
+    lost = run("train", "fundamental", "--out", "half")
+    assert lost.exit_code == 2
+    assert "start must name the agent file" in lost.stderr
+    wrong = run("train", "fundamental", "--from", "fundamental", "--out", "half")
+    assert "holds a run that did not begin with" in wrong.stderr
+
+    again = run("train", "fundamental", "--out", "tuned")  # a run that has ended: nothing changes
+    assert again.exit_code == 0, again.output
+    for name, value in load_file("tuned/agent.safetensors").items():
+        np.testing.assert_array_equal(value, other[name])
+
+
+def test_wrong_data_and_weights(fails, run, tmp_path):
+    assert "--data is for fundamental matrices, not for a line" in fails("train", "line", "--data", ".")
+    assert "--data must hold sequences/NAME/image_0" in fails("train", "fundamental", "--data", ".")
+    assert "is no folder" in fails("train", "fundamental", "--data", "nowhere")
+    assert "there is no file 'nothing'" in fails("train", "line", "--from", "nothing")
+    assert "cannot be used with --paper" in fails("train", "line", "--from", "line", "--paper")
+    assert "was trained for d = 2, not a plane" in fails("train", "plane", "--from", "line")
+    assert "--set started_from: --from gives it" in fails("train", "line", "--set", "started_from=x")
+    (tmp_path / "sequences" / "00").mkdir(parents=True)
+    assert "holds 0 PNG images" in fails("train", "fundamental", "--data", ".", "--out", "a")
+
+
+def test_a_setting_of_text():
+    assert parse_settings(("chart=F32=1", "frames=3,9")) == {"chart": "F32=1", "frames": (3, 9)}
 
 
 def test_errors(run, fails, monkeypatch, tmp_path):

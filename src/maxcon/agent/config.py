@@ -11,6 +11,9 @@ from typing import Any
 
 from maxcon.tree.encoding import CHANNELS, PAPER_CHANNELS
 
+#: Settings that agent files may lack, being older.
+_LATER = {"estimate"}
+
 
 @dataclass(frozen=True)
 class NetworkConfig:
@@ -30,6 +33,9 @@ class NetworkConfig:
         Which channels the state has besides H; departure 1 adds "ratio", "level" and "multiplier".
     canonical
         Departure 2: H in a form that does not depend on the units of the data.
+    estimate
+        Departure 12: H has a further column, the residual of theta = 0 relative to the threshold. Only for problems
+        posed so that theta = 0 is an estimate.
     """
 
     widths: tuple[int, ...] = (32, 32, 64)
@@ -38,6 +44,7 @@ class NetworkConfig:
     head: tuple[int, ...] = (64, 32)
     channels: tuple[str, ...] = CHANNELS
     canonical: bool = True
+    estimate: bool = False
 
 
 @dataclass(frozen=True)
@@ -101,11 +108,40 @@ class TrainConfig:
 
 
 @dataclass(frozen=True)
+class DataConfig:
+    """Where the training instances come from; `maxcon.experiments.training` draws them.
+
+    Attributes
+    ----------
+    source
+        "hyperplane": the paper's lines and planes. Of fundamental matrices: "scene" (made scenes), "modelnet" (meshes
+        of ModelNet40) or "kitti" (random matches of image pairs of a drive).
+    threshold
+        The inlier threshold that an episode goes down to.
+    chart
+        The chart of the fundamental matrix (`maxcon.vision.fundamental_problem`).
+    sequence, frames, steps
+        Of "kitti": which drive, the first and the last frame used, and how far apart the frames of a pair are.
+    started_from
+        The SHA-256 digest of the agent file that training started from; empty where it started from nothing.
+    """
+
+    source: str = "hyperplane"
+    threshold: float = 0.1
+    chart: str = "auto"
+    sequence: str = ""
+    frames: tuple[int, ...] = (0, 24)
+    steps: tuple[int, ...] = (1, 3)
+    started_from: str = ""
+
+
+@dataclass(frozen=True)
 class AgentConfig:
-    """Network and training together."""
+    """Network, training and the data of the training together."""
 
     network: NetworkConfig = field(default_factory=NetworkConfig)
     train: TrainConfig = field(default_factory=TrainConfig)
+    data: DataConfig = field(default_factory=DataConfig)
 
     def to_dict(self) -> dict[str, Any]:
         """Return nested plain dictionaries, for JSON."""
@@ -113,34 +149,38 @@ class AgentConfig:
 
     @classmethod
     def from_dict(cls, values: dict[str, Any]) -> AgentConfig:
-        """Return the configuration that `to_dict` made `values` of; ValueError if a setting is missing or unknown."""
+        """Return the configuration that `to_dict` made `values` of; ValueError if a setting is missing or unknown.
+
+        What came later than the first agent files may be missing, and then has its default: all of "data", and
+        "estimate".
+        """
 
         def build(kind: type[Any], entries: dict[str, Any]) -> Any:
             known = {each.name for each in fields(kind)}
-            if known != set(entries):
+            if not known - _LATER <= set(entries) <= known:
                 raise ValueError(f"values must have the settings {sorted(known)}, but they have {sorted(entries)}")
             return kind(**{k: tuple(v) if isinstance(v, list) else v for k, v in entries.items()})
 
-        return cls(build(NetworkConfig, values["network"]), build(TrainConfig, values["train"]))
+        data = build(DataConfig, values["data"]) if "data" in values else DataConfig()
+        return cls(build(NetworkConfig, values["network"]), build(TrainConfig, values["train"]), data)
 
     def override(self, **changes: Any) -> AgentConfig:
-        """Return a copy with the named fields, of the network or of the training, changed.
+        """Return a copy with the named fields, of the network, the training or its data, changed.
 
         Raises
         ------
         TypeError
             If no field has the name.
         """
-        network_names = {each.name for each in fields(NetworkConfig)}
-        train_names = {each.name for each in fields(TrainConfig)}
-        unknown = set(changes) - network_names - train_names
-        if unknown:
-            raise TypeError(
-                f"unknown setting {sorted(unknown)[0]!r}; settings are {sorted(network_names | train_names)}"
-            )
+        parts = {name: {each.name for each in fields(getattr(self, name))} for name in ("network", "train", "data")}
+        known = set().union(*parts.values())
+        if unknown := set(changes) - known:
+            raise TypeError(f"unknown setting {sorted(unknown)[0]!r}; settings are {sorted(known)}")
         return AgentConfig(
-            replace(self.network, **{k: v for k, v in changes.items() if k in network_names}),
-            replace(self.train, **{k: v for k, v in changes.items() if k in train_names}),
+            *(
+                replace(getattr(self, part), **{name: value for name, value in changes.items() if name in names})
+                for part, names in parts.items()
+            )
         )
 
 
@@ -160,4 +200,32 @@ def paper(n_params: int, seed: int = 0) -> AgentConfig:
         target_every=0,
         n_step=1,
         double=False,
+    )
+
+
+def fundamental(base: AgentConfig, source: str = "scene") -> AgentConfig:
+    """Return `base` for fundamental matrices, d = 8: the paper's outlier rates of section 4.2, 10 to 50%.
+
+    An agent that departs from the paper at all is told of the chart's estimate, too (departure 12).
+
+    Parameters
+    ----------
+    base
+        `shipped` or `paper` of 8 parameters.
+    source
+        "scene", "modelnet" or "kitti"; the threshold is the paper's for each, 0.1 or, for "kitti", 0.01.
+    """
+    threshold = 0.01 if source == "kitti" else 0.1
+    return base.override(
+        source=source, threshold=threshold, low_rate=0.1, high_rate=0.5, estimate=base.network.canonical
+    )
+
+
+def fine_tuning(base: AgentConfig, seed: int = 0) -> AgentConfig:
+    """Return the configuration that goes on with a trained agent of configuration `base` on other data.
+
+    Smaller steps and less exploration than from nothing, so that what was learned is not thrown away first.
+    """
+    return base.override(
+        seed=seed, learning_rate=2e-4, final_learning_rate=1e-5, exploration=0.1, final_exploration=0.02, updates=5000
     )

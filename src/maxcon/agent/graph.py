@@ -1,4 +1,4 @@
-"""The neighbour graph on H and the maximum over neighbours: what an EdgeConv layer does besides multiplying.
+"""The features H, the neighbour graph on them and the maximum over neighbours: what EdgeConv does besides multiplying.
 
 An EdgeConv with one linear layer, ``max_j W [x_i, x_j - x_i] + b`` over the neighbours j (Wang et al. 2019), splits
 into ``p_i + max_j q_j`` with ``p = x (W1 - W2) + b`` and ``q = x W2``; LayerNorm and leaky ReLU follow.
@@ -10,7 +10,16 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from maxcon.agent.config import NetworkConfig
 from maxcon.minimax.jit import kernel
+from maxcon.problem import LinearProblem
+from maxcon.tree.encoding import canonical_features, estimate_feature, raw_features
+
+
+def point_features(problem: LinearProblem, threshold: float, config: NetworkConfig) -> NDArray[np.float32]:
+    """Return H, shape (N, features): what a network of this configuration reads of a problem, whatever the state."""
+    H = canonical_features(problem) if config.canonical else raw_features(problem)
+    return np.hstack([H, estimate_feature(problem, threshold)]) if config.estimate else H
 
 
 def neighbour_graph(H: NDArray[np.float32], neighbours: int) -> NDArray[np.int32]:

@@ -14,11 +14,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from maxcon.agent.config import AgentConfig
-from maxcon.agent.graph import neighbour_graph
+from maxcon.agent.graph import neighbour_graph, point_features
 from maxcon.agent.weights import load_weights
 from maxcon.minimax.jit import kernel
 from maxcon.problem import LinearProblem
-from maxcon.tree.encoding import canonical_features, channel_flags, raw_features
+from maxcon.tree.encoding import channel_flags
 
 #: Slope of the leaky ReLU below 0, as in `network`.
 LEAK = np.float32(0.2)
@@ -92,19 +92,27 @@ class Agent:
         """Which of the channels of `maxcon.tree.encoding` it reads."""
         return channel_flags(self.config.network.channels)
 
-    def prepare(self, problem: LinearProblem) -> Scratch:
+    def prepare(self, problem: LinearProblem, threshold: float) -> Scratch:
         """Return what `q_values` needs to know about `problem` once.
+
+        Parameters
+        ----------
+        problem
+            The problem.
+        threshold
+            The inlier threshold, in the unit of b.
 
         Raises
         ------
         ValueError
             If the problem has another number of features than the agent was trained on.
         """
-        H = canonical_features(problem) if self.config.network.canonical else raw_features(problem)
+        H = point_features(problem, threshold, self.config.network)
         if H.shape[1] != self.parameters.n_features:
+            further = 1 + self.config.network.estimate  # columns that are no column of A
             raise ValueError(
-                f"problem must have {self.parameters.n_features - 1} columns that vary for this agent, "
-                f"but it has {H.shape[1] - 1}"
+                f"problem must have {self.parameters.n_features - further} columns that vary for this agent, "
+                f"but it has {H.shape[1] - further}"
             )
         return make_scratch(self.parameters, H, neighbour_graph(H, self.config.network.neighbours))
 

@@ -13,12 +13,12 @@ from torch import Tensor
 from torch.nn import functional
 
 from maxcon.agent.config import AgentConfig
-from maxcon.agent.graph import neighbour_graph
+from maxcon.agent.graph import neighbour_graph, point_features
 from maxcon.agent.network import QNetwork
 from maxcon.agent.replay import ReplayMemory, StateBatch, encode
 from maxcon.problem import LinearProblem
 from maxcon.tree.batch import BatchEnvironment, Instances, make_instances
-from maxcon.tree.encoding import canonical_features, channel_flags, raw_features
+from maxcon.tree.encoding import channel_flags
 
 #: How often in a row an instance that needs no removal may be drawn: then there is hardly another.
 _MOST_DRAWS = 1000
@@ -35,8 +35,7 @@ class TrainingSet:
 
 def prepare(problems: list[LinearProblem], threshold: float, config: AgentConfig) -> TrainingSet:
     """Return `problems`, all of one size, as the network and the environment need them."""
-    features = canonical_features if config.network.canonical else raw_features
-    H = [features(problem) for problem in problems]
+    H = [point_features(problem, threshold, config.network) for problem in problems]
     graph = [neighbour_graph(each, config.network.neighbours) for each in H]
     return TrainingSet(
         make_instances(problems, threshold), torch.from_numpy(np.stack(H)), torch.from_numpy(np.stack(graph))

@@ -1,4 +1,7 @@
-"""The agents in the wheel: one safetensors file and one model card for each family."""
+"""The agents in the wheel: one safetensors file and one model card each.
+
+An agent that has the name of a family of problems serves it; the others, such as "fundamental-paper", are asked for.
+"""
 
 from __future__ import annotations
 
@@ -31,6 +34,12 @@ def agent_path(name: str) -> Path:
     return _FOLDER / f"{name}.safetensors"
 
 
+def agent_file(weights: str | Path) -> Path:
+    """Return the file that is meant: `weights`, or the shipped agent of that name where there is no such file."""
+    path = Path(weights)
+    return agent_path(str(weights)) if str(weights) in agent_names() and not path.exists() else path
+
+
 def model_card(name: str) -> str:
     """Return the model card of a shipped agent, Markdown; ValueError if there is no agent of this name."""
     return agent_path(name).with_suffix(".md").read_text(encoding="utf-8")
@@ -44,9 +53,10 @@ def shipped_agent(problem: LinearProblem) -> Agent:
     ValueError
         If none is shipped for it.
     """
-    if problem.family not in agent_names():
+    families = [name for name in agent_names() if "-" not in name]
+    if problem.family not in families:
         raise ValueError(
-            f"method 'agent' has shipped agents for the families {', '.join(agent_names())}, but the problem is of "
+            f"method 'agent' has shipped agents for the families {', '.join(families)}, but the problem is of "
             f"the family {problem.family!r}: pass weights=FILE of an agent trained for it, or use another method"
         )
     return _load(problem.family)

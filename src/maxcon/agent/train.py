@@ -24,7 +24,7 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
 from maxcon.agent.config import AgentConfig
 from maxcon.agent.learn import Learner, TrainingSet
-from maxcon.agent.weights import save_weights
+from maxcon.agent.weights import load_weights, save_weights
 from maxcon.tree.batch import BatchEnvironment
 
 
@@ -69,6 +69,7 @@ def train(
     held_out: HeldOut,
     folder: Path,
     *,
+    start: Path | None = None,
     report_every: int = 500,
     checkpoint_seconds: float = 30.0,
     progress: bool = True,
@@ -78,15 +79,33 @@ def train(
     Ctrl-C ends the training after the running update and keeps the checkpoint: called again, it goes on from
     there to the same result as if it had never been stopped.
 
+    Parameters
+    ----------
+    config
+        What is trained, and how.
+    data, held_out
+        Trained on, and reported on.
+    folder
+        Of the run; made if need be.
+    start
+        An agent file whose parameters a new run begins with; None to begin with random ones.
+    report_every
+        After how many updates the held-out gap is logged.
+    checkpoint_seconds
+        How often everything is saved.
+    progress
+        Whether to show a progress bar.
+
     Raises
     ------
     ValueError
-        If `folder` holds a run with another configuration.
+        If `folder` holds a run with another configuration, or `start` holds a network of another shape, or is needed
+        and absent.
     """
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
     try:
-        return _train(config, data, held_out, folder, report_every, checkpoint_seconds, progress)
+        return _train(config, data, held_out, folder, start, report_every, checkpoint_seconds, progress)
     finally:
         torch.set_num_threads(threads)
 
@@ -96,6 +115,7 @@ def _train(
     data: TrainingSet,
     held_out: HeldOut,
     folder: Path,
+    start: Path | None,
     report_every: int,
     checkpoint_seconds: float,
     progress: bool,
@@ -111,6 +131,10 @@ def _train(
         )
     if (folder / "checkpoint.pt").exists():
         load_checkpoint(learner, folder / "checkpoint.pt")
+    elif start is not None:
+        begin_with(learner, start)
+    elif config.data.started_from:
+        raise ValueError(f"start must name the agent file that the run began with, but {folder} has no checkpoint yet")
     log = _Log(folder, learner.updates)
     saved = time.perf_counter()
     losses: list[float] = []
@@ -135,6 +159,18 @@ def _train(
     if learner.updates >= total:
         save_weights(learner.network, config, folder / "agent.safetensors")
     return learner
+
+
+def begin_with(learner: Learner, weights: Path) -> None:
+    """Put the parameters of an agent file into both networks of `learner`; ValueError if they do not fit."""
+    tensors, config = load_weights(weights)
+    if config.network != learner.config.network:
+        raise ValueError(f"start must hold a network of {learner.config.network}, but it holds one of {config.network}")
+    known = {name: tuple(value.shape) for name, value in learner.network.state_dict().items()}
+    if {name: value.shape for name, value in tensors.items()} != known:
+        raise ValueError(f"start must hold a network for d = {learner.config.train.n_params}, but {weights} does not")
+    for network in (learner.network, learner.target):
+        network.load_state_dict({name: torch.from_numpy(value.copy()) for name, value in tensors.items()})
 
 
 def save_checkpoint(learner: Learner, path: Path) -> None:
@@ -174,11 +210,11 @@ def _claim(folder: Path, config: AgentConfig) -> None:
     path = folder / "config.json"
     text = json.dumps(config.to_dict(), indent=2, sort_keys=True)
     if path.exists():
-        before = json.loads(path.read_text(encoding="utf-8"))
+        before = json.loads(json.dumps(AgentConfig.from_dict(json.loads(path.read_text("utf-8"))).to_dict()))
         after = json.loads(text)
         for part in sorted(after):
             for name, value in after[part].items():
-                if (was := before.get(part, {}).get(name)) != value:
+                if (was := before[part][name]) != value:
                     raise ValueError(
                         f"folder holds a run with another configuration ({path}): its {name} is {was}, not {value}; "
                         "name a new folder"

@@ -12,7 +12,20 @@ import click
 from maxcon import __version__
 
 #: The commands in the order of the help; ``maxcon.cli.NAME`` holds ``command`` (a dash in NAME is _).
-_COMMANDS = ("fit", "fit-pair", "curve", "alternatives", "verify", "demo", "methods", "agents", "train", "evaluate")
+_COMMANDS = (
+    "fit",
+    "fit-pair",
+    "curve",
+    "alternatives",
+    "verify",
+    "demo",
+    "methods",
+    "agents",
+    "train",
+    "evaluate",
+    "bench",
+    "reproduce",
+)
 
 #: What a shell expects of a program that Ctrl-C ended.
 INTERRUPTED = 130

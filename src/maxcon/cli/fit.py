@@ -217,7 +217,7 @@ def write_proof(out: str, problem: LinearProblem, consensus: Consensus) -> str:
     import maxcon  # noqa: PLC0415
 
     with console(stderr=True).status("writing the certificate ..."), reported():
-        written = maxcon.write_certificate(out, problem, consensus)
+        written = maxcon.write_certificate(out, consensus)
     proven = problem.n_points - sum(group.needed for group in written.groups)
     if proven <= written.upper_bound:
         return f"proves that no model has more than {proven} inliers"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import _thread
+import hashlib
 import json
 import shlex
 import signal
@@ -17,7 +18,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import click
 import numpy as np
 
-from maxcon.agent.config import AgentConfig, paper, shipped
+from maxcon.agent.config import AgentConfig, fine_tuning, fundamental, paper, shipped
 from maxcon.cli.errors import Failure, reported
 from maxcon.cli.interrupt import deferred
 from maxcon.cli.output import check_folder
@@ -28,10 +29,10 @@ if TYPE_CHECKING:
     from maxcon.problem import LinearProblem
 
 #: Parameters of the models of each family.
-N_PARAMS = {"line": 2, "plane": 3}
+N_PARAMS = {"line": 2, "plane": 3, "fundamental": 8}
 
 #: Settings that have an option or argument of their own.
-_FIXED = {"n_params", "seed", "updates"}
+_FIXED = {"n_params": "FAMILY", "seed": "--seed", "updates": "--updates", "source": "--data", "started_from": "--from"}
 
 
 class _HeldOut(NamedTuple):
@@ -50,9 +51,23 @@ class _HeldOut(NamedTuple):
     "--minutes", type=click.FloatRange(min=0, min_open=True), help="Stop after so long; called again, it goes on."
 )
 @click.option(
-    "--out", metavar="DIR", help="The folder of the run.  [default: runs/FAMILY-seedSEED, with -paper for --paper]"
+    "--out",
+    metavar="DIR",
+    help="The folder of the run.  [default: runs/FAMILY-seedSEED, with -paper for --paper, -tuned for --from]",
 )
 @click.option("--paper", "as_paper", is_flag=True, help="Train strictly as the paper writes, without any departure.")
+@click.option(
+    "--data",
+    metavar="FOLDER",
+    help="Fundamental matrices from a KITTI odometry folder (matches of frame pairs) or from ModelNet40 (meshes).  "
+    "[default: made scenes]",
+)
+@click.option(
+    "--from",
+    "start",
+    metavar="WEIGHTS",
+    help="Fine-tune an agent: a file, or the name of a shipped one; network and settings are its own.",
+)
 @click.option(
     "--set", "changes", multiple=True, metavar="KEY=VALUE", help="Change a setting of the agent; may be repeated."
 )
@@ -63,27 +78,37 @@ def command(
     minutes: float | None,
     out: str | None,
     as_paper: bool,
+    data: str | None,
+    start: str | None,
     changes: tuple[str, ...],
 ) -> None:
-    """Train an agent for lines or planes on random instances of the paper's protocol.
+    """Train an agent for lines or planes on random instances of the paper's protocol, or for fundamental matrices.
 
     DIR gets config.json, log.jsonl, TensorBoard events, checkpoint.pt and, at the end, agent.safetensors, which
     `maxcon fit --method agent --option weights=FILE` and `maxcon evaluate --weights NAME=FILE` take. Ctrl-C
     keeps the checkpoint. Where DIR holds a run, that run goes on, to the same end as if it had not been stopped.
+
+    Fundamental matrices (d = 8) come from made scenes with 10 to 50% outliers, threshold 0.1, in the chart "auto". With
+    --data they come from the training meshes of ModelNet40, or from pairs of frames of a KITTI drive at the threshold
+    0.01: frames 0 to 24 train, later ones are held out (--set frames=0,24 --set steps=1,3 --set sequence=NAME).
+    No label is used anywhere.
 
     \b
     Examples:
       maxcon train line
       maxcon train plane --seed 1 --set n_points=200 --out runs/big
       maxcon train line --out runs/line-seed0        (goes on with what was stopped)
+      maxcon train fundamental --from fundamental --data kitti
     """
     for module in ("torch", "tensorboard"):
         if find_spec(module) is None:
             raise Failure(f"training needs {module}, which is not installed: pip install 'maxcon[train]'")
-    config, folder = _run(family, seed, updates, out, as_paper, changes)
-    learner, held_out = _train(config, folder, minutes, family)
+    place = _Place(*_data_folder(family, data), _weights(start, as_paper))
+    config, folder = _run(family, seed, updates, out, as_paper, place, changes)
+    learner, held_out = _train(config, folder, minutes, family, place)
     total = config.train.updates
-    again = f"maxcon train {family} --out {shlex.quote(str(folder))}"
+    given = "".join(f" {name} {shlex.quote(value)}" for name, value in (("--data", data), ("--from", start)) if value)
+    again = f"maxcon train {family}{given} --out {shlex.quote(str(folder))}"
     if learner is None or (learner.updates < total and minutes is None):
         done = 0 if learner is None else learner.updates
         kept = f"the checkpoint is in {folder}" if learner is not None else "there is no checkpoint yet"
@@ -99,6 +124,42 @@ def command(
     click.echo(f"wrote {weights}")
 
 
+class _Place(NamedTuple):
+    """What training takes from the disk: the kind of the data, their folder, and the weights to begin with."""
+
+    source: str | None
+    folder: Path | None
+    start: Path | None
+
+
+def _data_folder(family: str, data: str | None) -> tuple[str | None, Path | None]:
+    """Return what kind of data is in the folder of --data, and the folder; Failure if it is none that is known."""
+    if data is None:
+        return None, None
+    if family != "fundamental":
+        raise Failure(f"--data is for fundamental matrices, not for a {family}")
+    folder = Path(data)
+    if (folder / "sequences").is_dir():
+        return "kitti", folder
+    if any(folder.glob("*/train/*.off")):
+        return "modelnet", folder
+    raise Failure(
+        f"--data must hold sequences/NAME/image_0/*.png (KITTI odometry) or CLASS/train/*.off (ModelNet40), "
+        f"but {data!r} {'does not' if folder.is_dir() else 'is no folder'}"
+    )
+
+
+def _weights(start: str | None, as_paper: bool) -> Path | None:
+    """Return the agent file to begin with."""
+    if start is None:
+        return None
+    if as_paper:
+        raise Failure("--from brings its own settings: it cannot be used with --paper")
+    from maxcon.agent.shipped import agent_file  # noqa: PLC0415
+
+    return agent_file(start)
+
+
 def parse_settings(pairs: tuple[str, ...]) -> dict[str, Any]:
     """Return KEY=VALUE pairs as settings, each of the type of its default.
 
@@ -108,17 +169,18 @@ def parse_settings(pairs: tuple[str, ...]) -> dict[str, Any]:
         If there is no such setting, or the value is none of its type.
     """
     defaults = AgentConfig().to_dict()
-    known = defaults["network"] | defaults["train"]
+    known = defaults["network"] | defaults["train"] | defaults["data"]
     settings: dict[str, Any] = {}
     for pair in pairs:
         key, equals, value = pair.partition("=")
         if not equals:
             raise Failure(f"--set must be KEY=VALUE, but it is {pair!r}")
         if key in _FIXED:
-            instead = "FAMILY" if key == "n_params" else f"--{key}"
-            raise Failure(f"--set {key}: {instead} gives it")
+            raise Failure(f"--set {key}: {_FIXED[key]} gives it")
         if key not in known:
-            raise Failure(f"--set: there is no setting {key!r}; settings are {', '.join(sorted(set(known) - _FIXED))}")
+            raise Failure(
+                f"--set: there is no setting {key!r}; settings are {', '.join(sorted(set(known) - set(_FIXED)))}"
+            )
         settings[key] = _typed(key, value, known[key])
     return settings
 
@@ -132,6 +194,8 @@ def _typed(key: str, value: str, default: Any) -> Any:
             return int(value)
         if isinstance(default, float):
             return float(value)
+        if isinstance(default, str):
+            return value
         items = [item.strip() for item in value.strip("[]()").split(",") if item.strip()]
         return tuple(int(item) for item in items) if isinstance(default[0], int) else tuple(items)
     except (ValueError, KeyError):
@@ -141,60 +205,108 @@ def _typed(key: str, value: str, default: Any) -> Any:
 
 
 def _run(
-    family: str, seed: int | None, updates: int | None, out: str | None, as_paper: bool, changes: tuple[str, ...]
+    family: str,
+    seed: int | None,
+    updates: int | None,
+    out: str | None,
+    as_paper: bool,
+    place: _Place,
+    changes: tuple[str, ...],
 ) -> tuple[AgentConfig, Path]:
     """Return configuration and folder; a folder that holds a run gives the configuration, unless told otherwise."""
     n_params = N_PARAMS[family]
-    config = (paper if as_paper else shipped)(n_params, seed or 0)
-    with reported():
-        config = config.override(**parse_settings(changes))
-    if updates is not None:
-        config = config.override(updates=updates)
-    name = out if out is not None else f"runs/{family}{'-paper' * as_paper}-seed{seed or 0}"
-    folder = check_folder(name, "--out")
+    kind = "-paper" * as_paper + "-tuned" * (place.start is not None)
+    folder = check_folder(out if out is not None else f"runs/{family}{kind}-seed{seed or 0}", "--out")
     known = folder / "config.json"
     if known.exists() and not (as_paper or changes or seed is not None or updates is not None):
         with reported():
             config = AgentConfig.from_dict(json.loads(known.read_text(encoding="utf-8")))
         if config.train.n_params != n_params:
             raise Failure(f"--out: {str(folder)!r} holds a run for d = {config.train.n_params}, not for a {family}")
-    return config, folder
+        if config.data.source in ("kitti", "modelnet") and place.source != config.data.source:
+            raise Failure(f"--data must name the folder of {config.data.source} again to go on with {str(folder)!r}")
+        if place.start is not None and _digest(place.start) != config.data.started_from:
+            raise Failure(f"--from: {str(folder)!r} holds a run that did not begin with {str(place.start)!r}")
+        return config, folder
+    config = _new_run(family, seed or 0, as_paper, place)
+    with reported():
+        config = config.override(**parse_settings(changes))
+    return (config if updates is None else config.override(updates=updates)), folder
 
 
-def _train(config: AgentConfig, folder: Path, minutes: float | None, family: str) -> tuple[Learner | None, _HeldOut]:
+def _new_run(family: str, seed: int, as_paper: bool, place: _Place) -> AgentConfig:
+    """Return the configuration of a run before any setting is changed."""
+    n_params = N_PARAMS[family]
+    config = (paper if as_paper else shipped)(n_params, seed)
+    if place.start is not None:
+        from maxcon.agent.weights import load_weights  # noqa: PLC0415
+
+        with reported():
+            _, before = load_weights(place.start)
+        if before.train.n_params != n_params:
+            raise Failure(f"--from: {str(place.start)!r} was trained for d = {before.train.n_params}, not a {family}")
+        config = fine_tuning(before, seed).override(started_from=_digest(place.start))
+        if place.source == "kitti":
+            config = config.override(threshold=0.01)
+        return config if place.source is None else config.override(source=place.source)
+    return fundamental(config, place.source or "scene") if family == "fundamental" else config
+
+
+def _digest(file: Path) -> str:
+    """Return the SHA-256 digest of an agent file, by which a run knows what it began with."""
+    if not file.is_file():
+        raise Failure(f"--from must name an agent file, but there is no file {str(file)!r}")
+    return hashlib.sha256(file.read_bytes()).hexdigest()
+
+
+def _train(
+    config: AgentConfig, folder: Path, minutes: float | None, family: str, place: _Place
+) -> tuple[Learner | None, _HeldOut]:
     """Draw the instances and train; the learner is None if Ctrl-C came before the training began."""
     from maxcon.agent.learn import prepare  # noqa: PLC0415  (brings torch)
     from maxcon.agent.train import HeldOut, train  # noqa: PLC0415
-    from maxcon.datasets.synthetic import THRESHOLD  # noqa: PLC0415
     from maxcon.experiments.training import training_set  # noqa: PLC0415
 
     note = console(stderr=True)
-    with deferred() as stop, reported():
+    with deferred() as stop, reported(), _found():
         with note.status("drawing the training set ..."):
-            data = training_set(config)
+            data = training_set(config, place.folder)
         with note.status("solving the held-out instances ..."):
-            known = _held_out(config, stop)
+            known = _held_out(config, place.folder, stop)
             reference = np.array([goal for goal, _, _ in known.references], dtype=np.int64)
             rates = np.array(known.rates) / 100
-            held_out = HeldOut(prepare(known.problems, THRESHOLD, config), reference, rates)
+            held_out = HeldOut(prepare(known.problems, config.data.threshold, config), reference, rates)
     if stop.is_set():
         return None, known
-    what = "going on with the run" if (folder / "checkpoint.pt").exists() else f"training an agent for {family}s"
+    what = (
+        "going on with the run" if (folder / "checkpoint.pt").exists() else f"training an agent for {_plural(family)}"
+    )
     click.echo(f"{what}: {config.train.updates} updates, folder {folder}", err=True)
     with reported(), _alarm(minutes):
-        return train(config, data, held_out, folder), known
+        return train(config, data, held_out, folder, start=place.start), known
 
 
-def _held_out(config: AgentConfig, stop: threading.Event) -> _HeldOut:
+def _plural(family: str) -> str:
+    return "fundamental matrices" if family == "fundamental" else f"{family}s"
+
+
+@contextmanager
+def _found() -> Iterator[None]:
+    """Report data that are not there as a `Failure`."""
+    try:
+        yield
+    except FileNotFoundError as error:
+        raise Failure(str(error)) from error
+
+
+def _held_out(config: AgentConfig, folder: Path | None, stop: threading.Event) -> _HeldOut:
     """Draw instances that training never sees, and find the consensus that each should reach."""
-    from maxcon.datasets.synthetic import THRESHOLD  # noqa: PLC0415
     from maxcon.experiments import training  # noqa: PLC0415
-    from maxcon.experiments.evaluation import reference_consensus  # noqa: PLC0415
 
-    problems = training.held_out_problems(config)
-    rates = [rate for rate in training.HELD_OUT_RATES for _ in range(training.HELD_OUT_EACH)]
+    problems = training.held_out_problems(config, folder)
     nothing = (0, False, 0.0)  # after Ctrl-C the references are not used, and a fit would not be finished
-    references = [nothing if stop.is_set() else reference_consensus(problem, THRESHOLD) for problem in problems]
+    references = [nothing if stop.is_set() else training.reference(problem, config) for problem in problems]
+    rates = training.held_out_rates(config, problems, [goal for goal, _, _ in references])
     return _HeldOut(problems, rates, references)
 
 
@@ -232,13 +344,20 @@ def _report(held_out: _HeldOut, weights: Path, family: str, config: AgentConfig)
     agent = Contender("agent", "agent", {"weights": str(weights)})
     records = []
     with console(stderr=True).status("evaluating ..."), deferred() as stop:
-        run_instance(held_out.problems[0], (agent,), 0, 0)  # loads the kernels, so that no time includes that
+        run_instance(
+            held_out.problems[0], (agent,), 0, 0, held_out.references[0]
+        )  # loads the kernels, so that no time includes that
         for number, problem in enumerate(held_out.problems):
             if stop.is_set():
                 break
             rate, goal = held_out.rates[number], held_out.references[number]
-            records += run_instance(problem, (agent,), rate, number, goal)
+            records += run_instance(problem, (agent,), rate, number, goal, config.data.threshold)
     rows = [each for each in summarise(records) if each.name == "agent"]
     each = len(held_out.rates) // len(set(held_out.rates))
-    title = f"{family}, N = {config.train.n_points}, {each} held-out instances a rate"
+    many = (
+        f"{len(held_out.rates)} held-out instances"
+        if config.data.source == "kitti"
+        else f"{each} held-out instances a rate"
+    )
+    title = f"{family}, N = {config.train.n_points}, {many}"
     console().print(gap_table(rows, title))

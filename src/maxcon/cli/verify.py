@@ -15,8 +15,8 @@ from maxcon.cli.present import borderless, console, duration, plain
 from maxcon.cli.tables import N_COLUMNS, choose_columns, pose, read_table
 from maxcon.problem import LinearProblem
 
-#: The exit code where a certificate is refused.
-REFUSED = 1
+#: The exit codes where a certificate is refused, and where it is accepted but --rerun could not prove its claim.
+REFUSED, UNPROVEN = 1, 3
 
 
 @click.command(name="verify", short_help="Check a certificate against its data.")
@@ -68,7 +68,8 @@ def command(
     a sweep, with more by a mixed-integer programme, which can take long.
 
     DATA is a table as `maxcon fit` reads it; "-" reads standard input. Points are counted from 0. The exit
-    code is 0 if the certificate is accepted, 1 if it is refused, and 2 if something could not be read.
+    code is 0 if the certificate is accepted, 1 if it is refused, 2 if something could not be read, and 3 if it is
+    accepted but neither the file nor --rerun proves its claim.
 
     \b
     Examples:
@@ -92,6 +93,8 @@ def command(
         _show(report, None if isinstance(certificate, str) else certificate, f"{cert} about {data}")
     if not report.accepted:
         click.get_current_context().exit(REFUSED)
+    if rerun and not report.claim_confirmed:
+        click.get_current_context().exit(UNPROVEN)
 
 
 def _load(cert: str) -> Certificate | str:

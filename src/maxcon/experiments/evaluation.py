@@ -224,6 +224,7 @@ def run_instance(
     rate: int,
     number: int,
     reference: tuple[int, bool, float] | None = None,
+    threshold: float = THRESHOLD,
 ) -> list[Record]:
     """Return the records of one instance: every contender with every refinement, and the reference.
 
@@ -235,12 +236,14 @@ def run_instance(
         The methods.
     reference
         What `reference_consensus` says of the instance, if that is known already.
+    threshold
+        The inlier threshold.
     """
-    goal, proven, goal_seconds = reference or reference_consensus(problem, THRESHOLD)
+    goal, proven, goal_seconds = reference or reference_consensus(problem, threshold)
     runs: list[tuple[str, str | None, int, float, str | None]] = []
     for contender in contenders:
         for refine in REFINEMENTS:
-            result = _fit(problem, contender, refine, number)
+            result = _fit(problem, contender, refine, number, threshold)
             if isinstance(result, str):
                 runs.append((contender.name, refine, 0, 0.0, result))
             else:
@@ -337,10 +340,12 @@ class RecordFile:
         return kept
 
 
-def _fit(problem: LinearProblem, contender: Contender, refine: str | None, seed: int) -> Consensus | str:
+def _fit(
+    problem: LinearProblem, contender: Contender, refine: str | None, seed: int, threshold: float = THRESHOLD
+) -> Consensus | str:
     """Return the result, or what went wrong: a failed fit stays as a record."""
     try:
-        return fit(problem, THRESHOLD, method=contender.method, rng=seed, refine=refine, **contender.options)
+        return fit(problem, threshold, method=contender.method, rng=seed, refine=refine, **contender.options)
     except ArithmeticError as error:
         return str(error)
 

@@ -71,7 +71,8 @@ def whiten(A: NDArray[np.float64], b: NDArray[np.float64]) -> LinearRows:
     n_points, n_params = A.shape
     At, to_model = np.empty((n_params, n_points)), np.zeros((n_params, n_params))
     origin, rest = np.zeros(n_params), np.empty(n_points)
-    rank, size = _whiten(A, b, At, to_model, origin, rest, np.empty((3, max(n_params, 2), max(n_params, 2))))
+    scratch = np.empty((3, max(n_params, 2), max(n_params, 2)))
+    rank, size = _whiten(A, b, At, to_model, origin, rest, np.empty(n_params), scratch)
     # Where b is linear in A but for rounding, its rounding is not blown up to order 1.
     size = max(size, BELOW_SLACK * float(np.abs(b).max()))
     scale = 2.0 ** math.ceil(math.log2(size)) if size > 1e-300 else 1.0
@@ -87,6 +88,7 @@ def _whiten(
     to_model: NDArray[np.float64],
     origin: NDArray[np.float64],
     rest: NDArray[np.float64],
+    shifts: NDArray[np.float64],
     scratch: NDArray[np.float64],
 ) -> tuple[int, float]:
     """Whiten A into the first rows of W; return the rank and the largest |rest|.
@@ -96,19 +98,29 @@ def _whiten(
     """
     N, d = A.shape
     R, inverse, lengths, order = scratch[0], scratch[1], scratch[2, 0], scratch[2, 1]
+    constant = -1  # an intercept
     for j in range(d):
+        same = A[0, j] != 0.0
+        for i in range(1, N):
+            same = same and A[i, j] == A[0, j]
+        if same:
+            constant = j
+    for j in range(d):
+        # Beside an intercept, columns may be shifted; years and time stamps then lose nothing to their offset.
+        shift = A[0, j] if constant >= 0 and j != constant else 0.0
+        shifts[j] = shift
         largest = 0.0
         for i in range(N):
-            largest = max(largest, abs(A[i, j]))
+            largest = max(largest, abs(A[i, j] - shift))
         unit = 1.0  # a power of two: scaling by it is exact
         if largest > 0.0:
             unit = 2.0 ** float(np.round(np.log2(largest)))
         for i in range(N):
-            W[j, i] = A[i, j] / unit
+            W[j, i] = (A[i, j] - shift) / unit
         length = np.sqrt(_dot(W[j], W[j]))
         lengths[j] = (length if length > 0.0 else 1.0) * unit
         for i in range(N):
-            W[j, i] = A[i, j] / lengths[j]
+            W[j, i] = (A[i, j] - shift) / lengths[j]
         order[j] = j
         for k in range(d):
             R[j, k] = 0.0
@@ -168,9 +180,15 @@ def _whiten(
     for i in range(N):
         total = b[i]
         for j in range(d):
-            total -= A[i, j] * origin[j]
+            total -= (A[i, j] - shifts[j]) * origin[j]
         rest[i] = total
         largest = max(largest, abs(total))
+    if constant >= 0:  # from shifted columns to those of A
+        for j in range(d):
+            part = shifts[j] / A[0, constant]
+            origin[constant] -= part * origin[j]
+            for k in range(rank):
+                to_model[constant, k] -= part * to_model[j, k]
     return rank, largest
 
 

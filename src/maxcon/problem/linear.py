@@ -76,6 +76,10 @@ class LinearProblem:
         """``max|b|``: the size of the numbers that a residual is a difference of."""
         return float(np.abs(self.b).max())
 
+    def same_data(self, other: LinearProblem) -> bool:
+        """Whether another problem has the same A and b."""
+        return self is other or (np.array_equal(self.A, other.A) and np.array_equal(self.b, other.b))
+
     def residuals(self, model: ArrayLike) -> NDArray[np.float64]:
         """Return ``|A @ model - b|``, shape (N,), in the unit of b.
 

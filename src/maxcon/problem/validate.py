@@ -60,6 +60,27 @@ def check_number(value: Any, name: str) -> float:
         raise TypeError(f"{name} must be a number, but it is {value!r}") from None
 
 
+def check_time_limit(value: Any) -> None:
+    """Raise TypeError or ValueError if `value` is not a positive number of seconds or None."""
+    if value is not None and not check_number(value, "time_limit") > 0:
+        raise ValueError(f"time_limit must be a positive number of seconds or None, but it is {value}")
+
+
+def check_gap(value: Any) -> int:
+    """Return the gap at which a search may stop; TypeError or ValueError if it is not a whole number of at least 0."""
+    if isinstance(value, bool) or not isinstance(value, (int, np.integer)):
+        raise TypeError(f"gap must be a whole number, but it is {value!r}")
+    if value < 0:
+        raise ValueError(f"gap must be at least 0, but it is {value}")
+    return int(value)
+
+
+def check_callback(value: Any) -> None:
+    """Raise TypeError if `value` is neither None nor callable."""
+    if value is not None and not callable(value):
+        raise TypeError(f"callback must be callable, but it is a {type(value).__name__}")
+
+
 def check_threshold(value: Any) -> float:
     """Return the inlier threshold as a float.
 

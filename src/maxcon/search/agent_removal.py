@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from maxcon.agent.inference import Agent, Parameters, Scratch, q_values
-from maxcon.agent.shipped import shipped_agent
+from maxcon.agent.shipped import agent_file, shipped_agent
 from maxcon.minimax import Workspace, allocate
 from maxcon.minimax.jit import kernel
 from maxcon.minimax.linear import OK, basis_multipliers, basis_points, cold_fit, refit_after_removal
@@ -28,7 +28,7 @@ def agent_removal(
     task
         The problem.
     weights
-        An agent file; None for the agent shipped for this family of problems.
+        An agent file, or the name of a shipped agent; None for the one shipped for this family of problems.
     tries
         How many walks. The first takes the best action at every state; the others draw it with probability
         proportional to ``exp(Q / temperature)``.
@@ -44,8 +44,8 @@ def agent_removal(
         raise ValueError(f"tries must be a positive integer, but it is {tries!r}")
     if not check_number(temperature, "temperature") > 0:
         raise ValueError(f"temperature must be positive, but it is {temperature}")
-    agent = shipped_agent(task.problem) if weights is None else Agent.load(Path(weights))
-    scratch = agent.prepare(task.problem)
+    agent = shipped_agent(task.problem) if weights is None else Agent.load(agent_file(weights))
+    scratch = agent.prepare(task.problem, task.threshold)
     workspace = allocate(task.rows)
     N = task.problem.n_points
     channels = np.empty((N, agent.parameters.n_channels), dtype=np.float32)

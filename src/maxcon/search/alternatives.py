@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from maxcon.minimax import allocate, linear_rows, minimax_fit
 from maxcon.minimax.linear import OK, cold_fit
 from maxcon.problem import Consensus, LinearProblem, check_threshold, inlier_slack
-from maxcon.problem.validate import check_number
+from maxcon.problem.validate import check_callback, check_time_limit
 from maxcon.search.alternative_kernels import (
     DONE,
     FAILURES,
@@ -31,8 +31,8 @@ from maxcon.search.anytime import Step, Task, make_task, run
 from maxcon.search.conclusion import conclude
 from maxcon.search.exact import exact
 from maxcon.search.partition import exact_partition
+from maxcon.search.proof import prove
 from maxcon.search.refine import swap_refinement
-from maxcon.search.stabbing import exact_stabbing
 
 #: Work between two looks at the clock, in points of the fits that a node may take: some 10 ms.
 PIECE = 800_000
@@ -160,10 +160,8 @@ def alternative_optima(
         raise TypeError(f"limit must be a whole number, but it is {limit!r}")
     if limit < 1:
         raise ValueError(f"limit must be at least 1, but it is {limit}")
-    if time_limit is not None and not check_number(time_limit, "time_limit") > 0:
-        raise ValueError(f"time_limit must be a positive number of seconds or None, but it is {time_limit}")
-    if callback is not None and not callable(callback):
-        raise TypeError(f"callback must be callable, but it is a {type(callback).__name__}")
+    check_time_limit(time_limit)
+    check_callback(callback)
     task = make_task(problem, threshold, np.random.default_rng(0), time_limit)
     if consensus is None:
         consensus = conclude(task, run(task, exact(task), swap_refinement), "exact", 0, 0.0)
@@ -189,6 +187,8 @@ def _check_consensus(consensus: Consensus, problem: LinearProblem, threshold: fl
     N = problem.n_points
     if consensus.inlier_mask.shape != (N,):
         raise ValueError(f"consensus must be of this problem, with {N} points, but it has {len(consensus.inlier_mask)}")
+    if not consensus.problem.same_data(problem):
+        raise ValueError("consensus must be of this problem, but it is of other data")
     if consensus.threshold != threshold:
         raise ValueError(f"consensus must be at the threshold {threshold}, but it is at {consensus.threshold}")
     if consensus.status not in {"optimal", "infeasible"}:
@@ -271,8 +271,8 @@ class _Lister:
         problem = LinearProblem(A, b)
         rows = linear_rows(problem)
         rng = np.random.default_rng(0)
-        task = Task(problem, rows, self.task.threshold, limit / rows.scale, rng, self.task.deadline)
-        steps = exact_stabbing(task) if self.stabs else exact_partition(task, start=start, n_jobs=1)
+        task = replace(self.task, problem=problem, rows=rows, limit=limit / rows.scale, rng=rng)
+        steps = prove(task, start) if self.stabs else exact_partition(task, start=start, n_jobs=1)
         best = run(task, _until(steps, wanted), swap_refinement)
         if best.interrupted:
             raise _StoppedError
@@ -310,7 +310,7 @@ class _Lister:
 
     def look(self) -> None:
         """Stop where the time is over or the callback asks for it."""
-        if time.perf_counter() >= self.task.deadline:
+        if self.task.over():
             raise _StoppedError
         if self.callback is not None and self.callback(min(len(self.found), self.limit)):
             raise _StoppedError

@@ -39,6 +39,8 @@ class Task:
         need look at it only to size a long step.
     gap
         The gap at which the search may stop.
+    compiled
+        What `compile_seconds` said when the deadline was set: kernels compiled since do not count.
     """
 
     problem: LinearProblem
@@ -48,6 +50,15 @@ class Task:
     rng: np.random.Generator
     deadline: float = np.inf
     gap: int = 0
+    compiled: float = 0.0
+
+    def seconds_left(self) -> float:
+        """Return the seconds until the deadline, or infinity."""
+        return self.deadline + compile_seconds() - self.compiled - time.perf_counter()
+
+    def over(self) -> bool:
+        """Whether the time is over."""
+        return self.deadline < np.inf and self.seconds_left() <= 0.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -121,11 +132,11 @@ def make_task(
     gap: int = 0,
 ) -> Task:
     """Return the task for `problem`: whitened rows, the limit on gamma in their unit, the deadline."""
-    began, compiled = time.perf_counter(), compile_seconds()
+    compiled = compile_seconds()
+    deadline = np.inf if time_limit is None else time.perf_counter() + time_limit
     rows = linear_rows(problem)
-    deadline = np.inf if time_limit is None else began + time_limit + compile_seconds() - compiled
     limit = (threshold + inlier_slack(threshold, problem.scale)) / rows.scale
-    return Task(problem, rows, threshold, limit, rng, deadline, gap)
+    return Task(problem, rows, threshold, limit, rng, deadline, gap, compiled)
 
 
 def run(
@@ -138,7 +149,7 @@ def run(
 
     Kernels that are compiled on the way, once on a machine, do not count against the deadline.
     """
-    began, compiled = time.perf_counter(), compile_seconds()
+    began = time.perf_counter()
     best = Best(upper_bound=task.problem.n_points)
     try:
         for step in steps:
@@ -155,9 +166,7 @@ def run(
             now = time.perf_counter()
             if callback is not None and news and callback(Progress(best.size, best.upper_bound, now - began)):
                 break
-            if best.subset is not None and best.gap <= task.gap:
-                break
-            if now >= task.deadline and now >= task.deadline + compile_seconds() - compiled:
+            if (best.subset is not None and best.gap <= task.gap) or task.over():
                 break
     except KeyboardInterrupt:
         best.interrupted = True

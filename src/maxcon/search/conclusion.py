@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from maxcon.minimax import minimax_fit
+from maxcon.minimax import minimax_fit, rank_holds
 from maxcon.problem import Consensus, LinearProblem, Status, inlier_slack
 from maxcon.search.anytime import Best, Task
 
@@ -28,13 +28,7 @@ def conclude(task: Task, best: Best, method: str, seed: int | None, seconds: flo
         fit = minimax_fit(problem, subset)
         mask = problem.residuals(fit.model) <= limit
     n_inliers = int(mask.sum())
-    # A recount above the bound refutes the bound: then nothing is proven.
-    upper_bound = best.upper_bound if n_inliers <= best.upper_bound else problem.n_points
-    status: Status = "heuristic"
-    if upper_bound == n_inliers:  # also where all points are inliers, which needs no proof
-        status = "optimal"
-    elif upper_bound < problem.n_points:
-        status = "bounded"
+    upper_bound, status = _standing(task, n_inliers, best.upper_bound)
     return Consensus(
         model=fit.model,
         inlier_mask=mask,
@@ -59,11 +53,7 @@ def judge(task: Task, model: NDArray[np.float64], upper_bound: int, seconds: flo
     residuals = problem.residuals(model)
     mask = residuals <= task.threshold + inlier_slack(task.threshold, problem.scale)
     n_inliers = int(mask.sum())
-    status: Status = "heuristic"
-    if n_inliers == upper_bound:
-        status = "optimal" if n_inliers > 0 else "infeasible"
-    elif upper_bound < problem.n_points:
-        status = "bounded"
+    upper_bound, status = _standing(task, n_inliers, upper_bound)
     return Consensus(
         model=model,
         inlier_mask=mask,
@@ -80,6 +70,20 @@ def judge(task: Task, model: NDArray[np.float64], upper_bound: int, seconds: flo
         seconds=seconds,
         problem=problem,
     )
+
+
+def _standing(task: Task, n_inliers: int, upper_bound: int) -> tuple[int, Status]:
+    """Return the bound that stands, and what it makes of so many inliers.
+
+    A recount above the bound refutes it. And a bound on the whitened rows is none on the data where whitening took
+    columns for dependent that are not, to the letter: then nothing is proven.
+    """
+    N = task.problem.n_points
+    if n_inliers > upper_bound or (upper_bound < N and not rank_holds(task.problem)):
+        upper_bound = N
+    if upper_bound == n_inliers:  # also where all points are inliers, which needs no proof
+        return upper_bound, "optimal" if n_inliers > 0 else "infeasible"
+    return upper_bound, "bounded" if upper_bound < N else "heuristic"
 
 
 def any_feasible_set(task: Task) -> NDArray[np.bool_] | None:

@@ -88,32 +88,56 @@ def minimal_model(
     for draw in range(min(size, 2 * d + 8)):
         if rank == d:
             break
-        point = draw_next(state, pool, draw, size)
-        length = 0.0
-        for j in range(d):
-            table[rank, j] = At[places[j], point]
-            length = max(length, abs(table[rank, j]))
-        table[rank, d] = b[point]
-        for k in range(rank):
-            c = table[rank, k]
-            for j in range(k + 1, d + 1):
-                table[rank, j] -= c * table[k, j]
-        place = rank
-        largest = 0.0
-        for j in range(rank, d):
-            if abs(table[rank, j]) > largest:
-                largest = abs(table[rank, j])
-                place = j
-        if largest <= max(DEPENDENT * length, ROUNDING):
-            continue
-        if place != rank:
-            places[rank], places[place] = places[place], places[rank]
-            for k in range(rank + 1):
-                table[k, rank], table[k, place] = table[k, place], table[k, rank]
-        inverse = 1.0 / table[rank, rank]
-        for j in range(rank + 1, d + 1):
-            table[rank, j] *= inverse
-        rank += 1
+        if eliminate_point(At, b, draw_next(state, pool, draw, size), rank, table, places):
+            rank += 1
+    substitute_back(rank, table, places, x)
+
+
+@kernel
+def eliminate_point(
+    At: NDArray[np.float64],
+    b: NDArray[np.float64],
+    point: int,
+    rank: int,
+    table: NDArray[np.float64],
+    places: NDArray[np.int64],
+) -> bool:
+    """Write the row of `point`, freed of the `rank` rows before it, into ``table[rank]``; False if it depends on them.
+
+    `places` tells which column has gone where; it starts as 0, 1, 2, ...
+    """
+    d = At.shape[0]
+    length = 0.0
+    for j in range(d):
+        table[rank, j] = At[places[j], point]
+        length = max(length, abs(table[rank, j]))
+    table[rank, d] = b[point]
+    for k in range(rank):
+        c = table[rank, k]
+        for j in range(k + 1, d + 1):
+            table[rank, j] -= c * table[k, j]
+    place = rank
+    largest = 0.0
+    for j in range(rank, d):
+        if abs(table[rank, j]) > largest:
+            largest = abs(table[rank, j])
+            place = j
+    if largest <= max(DEPENDENT * length, ROUNDING):
+        return False
+    if place != rank:
+        places[rank], places[place] = places[place], places[rank]
+        for k in range(rank + 1):
+            table[k, rank], table[k, place] = table[k, place], table[k, rank]
+    inverse = 1.0 / table[rank, rank]
+    for j in range(rank + 1, d + 1):
+        table[rank, j] *= inverse
+    return True
+
+
+@kernel
+def substitute_back(rank: int, table: NDArray[np.float64], places: NDArray[np.int64], x: NDArray[np.float64]) -> None:
+    """Write the model of the `rank` rows of `table`, made by `eliminate_point`, into x."""
+    d = x.shape[0]
     for j in range(d):
         x[j] = 0.0
     for k in range(rank - 1, -1, -1):

@@ -1,15 +1,40 @@
-"""What "auto" does: prove where that is cheap; otherwise the best proposals, then the exact search for a while."""
+"""What "auto" does: it spends the time on the learned search and on proofs, by a small table of measured rules.
+
+| parameters | time limit | what is done |
+| --- | --- | --- |
+| up to 3 | none, or enough for a proof (`PROOF_SECONDS`) | the exact search |
+| up to 3 | less | the learned search for `SHORT_SHARE` of the time, then the exact search |
+| more | none | the learned search until it has settled, then `BRIEF_WORK` of the exact search |
+| more | up to `ALL_LEARNED` seconds | the learned search |
+| more | more | the learned search until it has settled, at most `LONG_SHARE` of the time; then the exact search |
+"""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from maxcon.search.anytime import Step, Task
-from maxcon.search.exact import MOST_PARAMETERS, exact
+from maxcon.search.learned import learned
 from maxcon.search.partition import check_jobs, exact_partition
-from maxcon.search.proposal import propose
+from maxcon.search.proof import MOST_PARAMETERS, prove
+from maxcon.search.refine import swap_refinement
+
+#: Seconds a point that the exact search takes at 90% outliers, by the number of parameters.
+PROOF_SECONDS = {0: 2e-6, 1: 2e-6, 2: 2e-6, 3: 4e-5}
+
+#: Where the time is too short for a proof, this part of it goes to the learned search first.
+SHORT_SHARE = 0.5
+
+#: With more than three parameters no proof is attempted in so little time, in seconds: what it would find or prove is
+#: less than what the learned search still gains.
+ALL_LEARNED = 0.02
+
+#: The learned search gets no more of the time than this where a proof is to follow.
+LONG_SHARE = 0.5
 
 #: Where no time is given, the exact search beyond three parameters ends after so much work, in columns of linear
 #: programmes: some 30 ms, which prove 20 to 30 outliers of 100 with eight parameters.
@@ -19,15 +44,10 @@ BRIEF_WORK = 1_000_000
 def auto(task: Task, *, n_jobs: int = -1) -> Iterator[Step]:
     """Yield ever better sets and bounds, by the methods that the problem and the time call for.
 
-    - Up to three parameters: the exact search, at any rate of outliers; it costs less than sampling.
-    - More, with a time limit: the best proposal, then the exact search until a proof or the time limit.
-    - More, without one: the same, but the exact search ends by itself after a fixed amount of work (some 30 ms), so
-      that the same data get the same answer; ``method="exact"`` goes on to the proof.
-
     Parameters
     ----------
     task
-        What is fitted.
+        What is fitted. Without a time limit the same data get the same answer; ``method="exact"`` goes on to a proof.
     n_jobs
         How many threads the exact search may use where there is a time limit; -1 for one a core.
 
@@ -37,15 +57,36 @@ def auto(task: Task, *, n_jobs: int = -1) -> Iterator[Step]:
         If `n_jobs` is not -1 or a whole number of at least 1.
     """
     check_jobs(n_jobs)
-    if task.problem.n_params <= MOST_PARAMETERS or task.deadline < np.inf:
-        return exact(task, n_jobs=n_jobs)
-    return _brief(task)
+    left = task.seconds_left()
+    if task.problem.n_params <= MOST_PARAMETERS:
+        if left >= PROOF_SECONDS[task.problem.n_params] * task.problem.n_points:
+            return prove(task, n_jobs=n_jobs)
+        return _short(task, left)
+    if left <= ALL_LEARNED:
+        return learned(task)
+    return _long(task, left, n_jobs)
 
 
-def _brief(task: Task) -> Iterator[Step]:
+def _short(task: Task, left: float) -> Iterator[Step]:
+    yield from learned(replace(task, deadline=task.deadline - (1.0 - SHORT_SHARE) * left))
+    yield from prove(task)
+
+
+def _long(task: Task, left: float, n_jobs: int) -> Iterator[Step]:
+    own = replace(task, deadline=task.deadline - (1.0 - LONG_SHARE) * left) if np.isfinite(left) else task
     best = np.zeros(task.problem.n_points, dtype=np.bool_)
-    for step in propose(task):
-        if step.subset is not None:
+    for step in learned(replace(task, deadline=np.inf)):  # which then ends by itself
+        if step.subset is not None and np.count_nonzero(step.subset) > np.count_nonzero(best):
             best = step.subset
         yield step
-    yield from exact_partition(task, start=best, n_jobs=1, max_work=BRIEF_WORK)
+        if own.over():
+            yield Step(subset=(best := _refined(task, best)), refined=True)
+            break
+    if np.isfinite(left):
+        yield from exact_partition(task, start=best, n_jobs=n_jobs)
+    else:
+        yield from exact_partition(task, start=best, n_jobs=1, max_work=BRIEF_WORK)
+
+
+def _refined(task: Task, best: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    return swap_refinement(task, best) if best.any() else best

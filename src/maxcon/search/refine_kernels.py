@@ -165,18 +165,19 @@ def _rounding(x: NDArray[np.float64]) -> float:
 @kernel
 def _add_witnessed(ws: Workspace, limit: float, scratch: RefineScratch) -> int:
     """Add all points that the vertex itself keeps within the limit, and re-fit; return how many they were."""
+    r, gain, cap, tried, fresh = ws.r, ws.gain, ws.cap, scratch.tried, scratch.fresh
     gamma = ws.x[ws.x.shape[0] - 1]
     safe = limit - 2.0 * _rounding(ws.x)  # at the very edge the simplex is asked, point by point
     count = 0
     farthest = -1
-    for i in range(ws.r.shape[0]):
-        scratch.fresh[i] = ws.cap[i] == np.inf and not scratch.tried[i] and abs(ws.r[i]) <= safe
-        if scratch.fresh[i]:
+    for i in range(r.shape[0]):
+        fresh[i] = cap[i] == np.inf and not tried[i] and abs(r[i]) <= safe
+        if fresh[i]:
             count += 1
-            if farthest < 0 or abs(ws.r[i]) > abs(ws.r[farthest]):
+            if farthest < 0 or abs(r[i]) > abs(r[farthest]):
                 farthest = i
-            ws.gain[i] = 1.0
-            ws.cap[i] = 0.0
+            gain[i] = 1.0
+            cap[i] = 0.0
     if count == 0 or abs(ws.r[farthest]) <= gamma:
         return count
     save_vertex(ws, scratch.copies, 0)
@@ -192,23 +193,25 @@ def _add_witnessed(ws: Workspace, limit: float, scratch: RefineScratch) -> int:
 
 
 @kernel
-def _write_certificate(ws: Workspace, leave: int, point: int, certificate: NDArray[np.int64]) -> None:
-    """Write the points of the basis rows that prove `point` infeasible, then -1.
+def _write_certificate(
+    C: NDArray[np.float64], q: NDArray[np.int64], leave: int, point: int, certificate: NDArray[np.int64]
+) -> None:
+    """Write into ``certificate[point]`` the points of the basis rows that prove `point` infeasible, then -1.
 
     If basis row `leave` >= 0 made room for it in the pivot that was not made, these are all others, since
     even a multiplier of 0 may have grown in it; with -1, at the vertex that proves it, those with a positive
     multiplier.
     """
-    n = ws.x.shape[0]
+    n = q.shape[0]
     size = 0
     for k in range(n):
-        if ws.q[k] < 0 or k == leave or ws.q[k] >> 1 == point:
+        if q[k] < 0 or k == leave or q[k] >> 1 == point:
             continue
-        if leave >= 0 or ws.C[n - 1, k] > BASIS_TOLERANCE:
-            certificate[size] = ws.q[k] >> 1
+        if leave >= 0 or C[n - 1, k] > BASIS_TOLERANCE:
+            certificate[point, size] = q[k] >> 1
             size += 1
     for k in range(size, n):
-        certificate[k] = -1
+        certificate[point, k] = -1
 
 
 @kernel
@@ -218,17 +221,18 @@ def _most_promising(ws: Workspace, limit: float, scratch: RefineScratch, moved: 
     The bounds are computed anew if the vertex has `moved`.
     """
     cap, tried, bound = ws.cap, scratch.tried, scratch.bound
+    C, q, leave, certificate = ws.C, ws.q, scratch.leave, scratch.certificate
     best = -1
     count = 0
     margin = limit + _rounding(ws.x)
     if moved:
-        addition_bounds(ws, bound, scratch.leave)
-    for i in range(ws.r.shape[0]):
+        addition_bounds(ws, bound, leave)
+    for i in range(tried.shape[0]):
         if tried[i] or cap[i] != np.inf:
             continue
         if bound[i] > margin:
             tried[i] = True
-            _write_certificate(ws, scratch.leave[i], i, scratch.certificate[i])
+            _write_certificate(C, q, leave[i], i, certificate)
             continue
         count += 1
         if best < 0 or bound[i] < bound[best]:
@@ -274,7 +278,7 @@ def _refine(ws: Workspace, limit: float, scratch: RefineScratch, least: int) -> 
         if moved:
             added += 1 + _add_witnessed(ws, limit, scratch)
         else:
-            _write_certificate(ws, -1, point, scratch.certificate[point])
+            _write_certificate(ws.C, ws.q, -1, point, scratch.certificate)
             ws.gain[point] = 0.0
             ws.cap[point] = np.inf
             load_vertex(ws, scratch.copies, 0)
@@ -329,14 +333,14 @@ def swap_kernel(ws: Workspace, limit: float, scratch: RefineScratch) -> int:
 @kernel
 def _most_blamed(ws: Workspace, scratch: RefineScratch) -> int:
     """Return the basis point in most certificates, at least two, that was not dropped before; or -1."""
-    N = ws.r.shape[0]
-    for i in range(N):
-        scratch.blame[i] = 0
-    for i in range(N):
-        if ws.cap[i] == np.inf:
-            for point in scratch.certificate[i]:
-                if point >= 0:
-                    scratch.blame[point] += 1
+    cap, blame, certificate = ws.cap, scratch.blame, scratch.certificate
+    for i in range(cap.shape[0]):
+        blame[i] = 0
+    for i in range(cap.shape[0]):
+        if cap[i] == np.inf:
+            for k in range(certificate.shape[1]):
+                if certificate[i, k] >= 0:
+                    blame[certificate[i, k]] += 1
     size = basis_points(ws.C, ws.q, scratch.basis)
     best = -1
     most = 1
@@ -351,41 +355,57 @@ def _most_blamed(ws: Workspace, scratch: RefineScratch) -> int:
 @kernel
 def _choose_substitutes(ws: Workspace, scratch: RefineScratch, point: int) -> None:
     """Let only the points with `point` in their certificate be tried; keep copies of these certificates."""
-    n = ws.x.shape[0]
-    for i in range(ws.r.shape[0]):
-        scratch.tried[i] = True
-        if ws.cap[i] == np.inf:
+    cap, tried, certificate, before = ws.cap, scratch.tried, scratch.certificate, scratch.before
+    n = certificate.shape[1]
+    for i in range(cap.shape[0]):
+        tried[i] = True
+        if cap[i] == np.inf:
             for k in range(n):
-                if scratch.certificate[i, k] == point:
-                    scratch.tried[i] = False
-            if not scratch.tried[i]:
-                scratch.before[i] = scratch.certificate[i]
+                if certificate[i, k] == point:
+                    tried[i] = False
+            if not tried[i]:
+                for k in range(n):
+                    before[i, k] = certificate[i, k]
 
 
 @kernel
 def _accept_swap(ws: Workspace, scratch: RefineScratch, point: int) -> None:
     """Give `point`, which is out now, the certificate of a point that has come in, the two exchanged."""
-    for i in range(ws.r.shape[0]):
-        scratch.dropped[i] = False
-        if ws.gain[i] == 1.0 and not scratch.kept[i]:
-            for k in range(ws.x.shape[0]):
-                scratch.certificate[point, k] = i if scratch.before[i, k] == point else scratch.before[i, k]
+    gain, kept, dropped, certificate, before = (
+        ws.gain,
+        scratch.kept,
+        scratch.dropped,
+        scratch.certificate,
+        scratch.before,
+    )
+    for i in range(gain.shape[0]):
+        dropped[i] = False
+        if gain[i] == 1.0 and not kept[i]:
+            for k in range(certificate.shape[1]):
+                certificate[point, k] = i if before[i, k] == point else before[i, k]
 
 
 @kernel
 def _undo_swap(ws: Workspace, scratch: RefineScratch) -> None:
     """Go back to the set before; of the new certificates keep those that hold for it, too."""
     load_vertex(ws, scratch.copies, 1)
-    for i in range(ws.r.shape[0]):
-        if scratch.kept[i]:
-            ws.gain[i] = 1.0
-            ws.cap[i] = 0.0
-        elif ws.gain[i] == 1.0:
-            ws.gain[i] = 0.0
-            ws.cap[i] = np.inf
-            scratch.certificate[i] = scratch.before[i]
-        elif ws.cap[i] == np.inf:
-            for point in scratch.certificate[i]:
-                if point >= 0 and not (scratch.kept[point] or (ws.gain[point] == 0.0 and ws.cap[point] < np.inf)):
-                    scratch.certificate[i] = scratch.before[i]
+    gain, cap, kept, certificate, before = ws.gain, ws.cap, scratch.kept, scratch.certificate, scratch.before
+    n = certificate.shape[1]
+    for i in range(gain.shape[0]):
+        stale = False
+        if kept[i]:
+            gain[i] = 1.0
+            cap[i] = 0.0
+        elif gain[i] == 1.0:
+            gain[i] = 0.0
+            cap[i] = np.inf
+            stale = True
+        elif cap[i] == np.inf:
+            for k in range(n):
+                point = certificate[i, k]
+                if point >= 0 and not (kept[point] or (gain[point] == 0.0 and cap[point] < np.inf)):
+                    stale = True
                     break
+        if stale:
+            for k in range(n):
+                certificate[i, k] = before[i, k]

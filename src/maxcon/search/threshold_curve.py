@@ -16,10 +16,10 @@ from numpy.typing import ArrayLike, NDArray
 from maxcon.minimax import linear_rows, minimax_fit
 from maxcon.problem import LinearProblem, inlier_slack
 from maxcon.problem.tolerance import ABSOLUTE_SLACK, RELATIVE_SLACK
-from maxcon.problem.validate import check_number
+from maxcon.problem.validate import check_number, check_time_limit
 from maxcon.search.anytime import Step, Task, make_task, run
+from maxcon.search.proof import prove
 from maxcon.search.refine import swap_refinement
-from maxcon.search.stabbing import exact_stabbing
 from maxcon.search.sweep import exact_sweep
 
 #: Independent parameters that interval stabbing can take.
@@ -222,7 +222,7 @@ def consensus_curve(
 
     Notes
     -----
-    Any model bounds all breakpoints from above by its sorted residuals, and an exact search (`exact_stabbing`; for
+    Any model bounds all breakpoints from above by its sorted residuals, and an exact search (`prove`; for
     lines that it leaves undecided `exact_sweep`) at one threshold bounds them from below: what it proves
     impossible there has a larger breakpoint. So each search is made just below, by the slack for rounding, the
     smallest f(S) known of k points: it finds a set of k points with a smaller one, or proves the breakpoint. The
@@ -233,8 +233,7 @@ def consensus_curve(
     if not isinstance(problem, LinearProblem):
         raise TypeError(f"problem must be a LinearProblem, but it is a {type(problem).__name__}")
     low, high = _check_range(thresholds)
-    if time_limit is not None and not check_number(time_limit, "time_limit") > 0:
-        raise ValueError(f"time_limit must be a positive number of seconds or None, but it is {time_limit}")
+    check_time_limit(time_limit)
     if callback is not None and not callable(callback):
         raise TypeError(f"callback must be callable, but it is a {type(callback).__name__}")
     rank = linear_rows(problem).At.shape[0]
@@ -282,7 +281,7 @@ class _Search:
         self.ends = low, high
         self.least = low + inlier_slack(low, problem.scale) if low > 0 else -np.inf
         self.most = high + inlier_slack(high, problem.scale)
-        self.methods: list[Callable[[Task], Iterator[Step]]] = [exact_stabbing]
+        self.methods: list[Callable[[Task], Iterator[Step]]] = [prove]
         if problem.n_params == 2:
             self.methods.append(exact_sweep)
         self.try_model(np.zeros(problem.n_params))
@@ -318,7 +317,7 @@ class _Search:
             limit = threshold + inlier_slack(threshold, self.problem.scale)
             bounded = self.lower[best.upper_bound :]
             np.maximum(bounded, np.minimum(limit, self.upper[best.upper_bound :]), out=bounded)
-            if best.interrupted or (left is not None and time.perf_counter() >= task.deadline):
+            if best.interrupted or task.over():
                 return False
             if best.gap <= 0:
                 break

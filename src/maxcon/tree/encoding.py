@@ -42,6 +42,14 @@ def canonical_features(problem: LinearProblem) -> NDArray[np.float32]:
     return np.column_stack([columns, signed / max(fit.value, np.finfo(float).tiny)]).astype(np.float32)
 
 
+def estimate_feature(problem: LinearProblem, threshold: float) -> NDArray[np.float32]:
+    """Return ``b_i / (|b_i| + threshold)``, shape (N, 1): the residual of theta = 0, in thresholds, squashed.
+
+    It says something where theta = 0 is an estimate, as in the chart "auto" of a fundamental matrix.
+    """
+    return (problem.b / (np.abs(problem.b) + threshold))[:, None].astype(np.float32)
+
+
 def _varying_columns(A: NDArray[np.float64]) -> NDArray[np.float64]:
     return A[:, np.ptp(A, axis=0) > 0]
 

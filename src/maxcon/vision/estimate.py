@@ -15,6 +15,9 @@ _REFINED = 48
 #: Samples before the first look at the confidence, and the confidence that is enough.
 _FIRST_CHUNK, _CONFIDENCE = 1000, 0.99
 
+#: Of more matches than this, so many are looked at.
+_MOST = 2000
+
 #: The refinement starts at so many scales; so many reweightings bring it down to one, and so many follow there.
 _WIDEST, _SHRINKING, _SETTLING = 2.0, 8, 5
 
@@ -26,7 +29,8 @@ def robust_estimate(
 
     Models through 8 random matches are scored by that sum (MSAC, Torr and Zisserman 2000); the best 48, and the
     total least-squares fit of all matches, are refined by total least squares, reweighted by a Geman-McClure loss
-    whose scale shrinks from 2 to 1 times `scale`; the best model met is returned. Its sign makes the entry of
+    whose scale shrinks from 2 to 1 times `scale`; the best model met is returned. Of more than 2,000 matches, so many
+    are drawn for all this. Its sign makes the entry of
     largest size positive.
 
     Parameters
@@ -41,6 +45,7 @@ def robust_estimate(
         How many samples are drawn at most: in chunks, until with probability 0.99 one of them was all inliers, were
         the best sampled model's inliers all there are.
     """
+    everything, rows = rows, _some(rows, rng)
     kept = min(_REFINED, samples)
     best, losses = np.zeros((kept, 9)), np.full(kept, np.inf)
     state, pool = seed_state(rng), np.arange(len(rows))
@@ -51,9 +56,16 @@ def robust_estimate(
         drawn += chunk
         within = int(np.count_nonzero(np.abs(rows @ best[np.argmin(losses)]) <= scale))
         needed = samples_needed(within, len(rows), 8, _CONFIDENCE)
-    f = _refined(rows, scale, np.vstack([best, smallest_directions(rows.T @ rows)]))
+    f = _refined(rows, scale, np.vstack([best, smallest_directions(everything.T @ everything)]))
     positive: NDArray[np.float64] = f * np.sign(f[np.argmax(np.abs(f))])
     return positive
+
+
+def _some(rows: NDArray[np.float64], rng: np.random.Generator) -> NDArray[np.float64]:
+    """Return the rows, or `_MOST` of them drawn at random where there are more: an estimate needs no more."""
+    if len(rows) <= _MOST:
+        return rows
+    return np.ascontiguousarray(rows[np.sort(rng.choice(len(rows), _MOST, replace=False))])
 
 
 def smallest_directions(moments: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -1,0 +1,89 @@
+"""Random problems for training and judging the learned search: four families at any rate, N and d."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from maxcon.datasets.synthetic import THRESHOLD, synthetic_hyperplane
+from maxcon.datasets.two_view_scene import synthetic_two_view
+from maxcon.problem import LinearProblem
+from maxcon.vision.fundamental import fundamental_problem
+
+#: Lines, planes, hyperplanes with 4 to 9 parameters, and fundamental matrices in two charts.
+FAMILIES = ("line", "plane", "hyperplane", "fundamental", "fundamental-F32")
+
+#: How often each is drawn in training, relative to each other: by how much there is to learn.
+WEIGHTS = {"line": 1.0, "plane": 1.0, "hyperplane": 2.0, "fundamental": 2.0, "fundamental-F32": 2.0}
+
+#: Random samples behind the chart "auto" of training problems: a rough estimate is enough to place the chart.
+CHART_SAMPLES = 400
+
+
+@dataclass(frozen=True)
+class Ranges:
+    """What training problems are drawn from.
+
+    Attributes
+    ----------
+    rates
+        The least and the largest outlier rate of lines and planes.
+    high_rates
+        The same where d >= 4: above, nobody finds the sets that were planted, and there is nothing to learn.
+    few, many
+        Ranges of N; two thirds of the problems have few points.
+    """
+
+    rates: tuple[float, float] = (0.3, 0.9)
+    high_rates: tuple[float, float] = (0.3, 0.8)
+    few: tuple[int, int] = (50, 200)
+    many: tuple[int, int] = (200, 600)
+
+
+def make_problem(
+    family: str, rng: np.random.Generator, n_points: int, rate: float, n_params: int = 8
+) -> tuple[LinearProblem, float]:
+    """Return a random problem and its threshold.
+
+    Parameters
+    ----------
+    family
+        One of `FAMILIES`.
+    rng
+        Draws everything.
+    n_points, rate
+        N and the outlier rate.
+    n_params
+        The number of parameters of a hyperplane.
+
+    Raises
+    ------
+    ValueError
+        If the family is unknown.
+    """
+    if family in {"line", "plane", "hyperplane"}:
+        d = {"line": 2, "plane": 3, "hyperplane": n_params}[family]
+        return synthetic_hyperplane(rng, n_points, rate, d), THRESHOLD
+    if family not in FAMILIES:
+        raise ValueError(f"family must be one of {', '.join(FAMILIES)}, but it is {family!r}")
+    scene = synthetic_two_view(n_points, rate, rng)
+    chart = "auto" if family == "fundamental" else "F32=1"
+    posed = fundamental_problem(scene.x1, scene.x2, chart=chart, threshold=THRESHOLD, rng=rng, samples=CHART_SAMPLES)
+    return posed.problem, THRESHOLD
+
+
+def draw_problem(families: Sequence[str], rng: np.random.Generator, ranges: Ranges) -> tuple[LinearProblem, float]:
+    """Return a random training problem of one of the families, with its threshold."""
+    weights = np.array([WEIGHTS[family] for family in families])
+    family = families[int(rng.choice(len(families), p=weights / weights.sum()))]
+    few = rng.random() < 2.0 / 3.0
+    low, high = ranges.few if few else ranges.many
+    n_points = int(np.exp(rng.uniform(np.log(low), np.log(high))))
+    low_rate, high_rate = ranges.rates if family in {"line", "plane"} else ranges.high_rates
+    rate = float(rng.uniform(low_rate, high_rate))
+    problem, threshold = make_problem(family, rng, n_points, rate, int(rng.integers(4, 10)))
+    if family.startswith("fundamental"):
+        threshold *= float(np.exp(rng.uniform(np.log(0.3), 0.0)))
+    return problem, threshold

@@ -1,0 +1,480 @@
+"""Training of the search networks by self-imitation: their labels are the best sets that anything has found.
+
+No ground truth enters. Each problem is fitted by LO-RANSAC, by graduated non-convexity and by the learned search as it
+stands, all with swap refinement. The best of these sets is the label: a point is right to believe in if it is in
+that set, and a basis point is right to remove if it is not. (Every basis of an infeasible set holds a point
+outside any given feasible set, so the perfect policy is this classification.)
+
+A round plays the search on fresh problems with the present networks and random settings, keeping what the networks saw;
+then both are updated on this and the last rounds' records. Point network: binary cross entropy. Peel network: half
+of that, and the cross entropy of a choice over the basis, of which every point outside the label is right.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import time
+from collections import deque
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from maxcon.agent.peel_features import N_PEEL_FEATURES
+from maxcon.agent.perceptron import LEAK, Perceptron, layers, perceptron, random_perceptron
+from maxcon.agent.point_features import N_POINT_FEATURES
+from maxcon.agent.search_networks import PEEL_WIDTHS, POINT_WIDTHS, SearchNetworks, save_search_networks
+from maxcon.experiments.search_instances import FAMILIES, Ranges, draw_problem, make_problem
+from maxcon.search.anytime import Task, make_task, run
+from maxcon.search.gnc import gnc
+from maxcon.search.learned import learned
+from maxcon.search.learned_kernels import (
+    BELIEVE,
+    PARTS,
+    PROPOSE,
+    SWAP,
+    WALK,
+    Settings,
+    begin_search,
+    finish_search,
+    play_parts,
+)
+from maxcon.search.learned_memory import ROUND, STEPS, WALKS, Search, allocate_arena, carve
+from maxcon.search.random_kernels import seed_state
+from maxcon.search.refine import swap_refinement
+from maxcon.search.sampling import lo_ransac
+
+if TYPE_CHECKING:
+    import torch
+
+#: Removals of a walk that are recorded.
+LOG_STEPS = 60
+
+#: Rows of a round that are kept of the point records, each round of each fit: so many points at random.
+POINTS_KEPT = 48
+
+
+@dataclass(frozen=True)
+class Recipe:
+    """The settings of a training.
+
+    Attributes
+    ----------
+    fits, updates
+        Fits and gradient steps of a round.
+    replayed
+        How many rounds' records are learned from.
+    batch_points, batch_steps
+        Rows of a point batch, and walk steps of a peel batch.
+    rate, last_rate
+        Adam's learning rate, falling geometrically from the first to the last over the rounds.
+    explore
+        How often a walk removes a random basis point.
+    play_rounds
+        How many rounds of the search a fit plays at least and at most.
+    samples
+        Samples of the LO-RANSAC that competes for the label.
+    label_rounds
+        Rounds of the search that competes for it, with the networks as they stand.
+    point_widths, peel_widths
+        Hidden widths of the networks.
+    """
+
+    fits: int = 80
+    updates: int = 60
+    replayed: int = 25
+    batch_points: int = 8192
+    batch_steps: int = 1024
+    rate: float = 3e-3
+    last_rate: float = 5e-5
+    explore: float = 0.1
+    play_rounds: tuple[int, int] = (3, 9)
+    samples: int = 1000
+    label_rounds: int = 25
+    point_widths: tuple[int, ...] = POINT_WIDTHS[1:-1]
+    peel_widths: tuple[int, ...] = PEEL_WIDTHS[1:-1]
+    ranges: Ranges = field(default_factory=Ranges)
+
+
+@dataclass
+class Records:
+    """What the networks saw in some fits, and what was right.
+
+    Attributes
+    ----------
+    points, points_right
+        Shapes (n, 18) and (n,).
+    steps, steps_right
+        Shapes (m, K, 12) and (m, K): -1 where a slot is empty; K = the largest d + 1.
+    """
+
+    points: NDArray[np.float32]
+    points_right: NDArray[np.float32]
+    steps: NDArray[np.float32]
+    steps_right: NDArray[np.float32]
+
+
+@dataclass(frozen=True)
+class TrainingProgress:
+    """What a progress callback is told after each round."""
+
+    round: int
+    rounds: int
+    point_loss: float
+    peel_loss: float
+    gained: float
+    seconds: float
+    held_out: dict[str, float] | None
+
+
+WIDEST_BASIS = 10
+
+
+def best_known(
+    problem: Any, threshold: float, samples: int, rng: np.random.Generator, nets: SearchNetworks | None, rounds: int
+) -> NDArray[np.bool_]:
+    """Return the largest of the sets that LO-RANSAC, graduated non-convexity and the search find, swapped."""
+    task = make_task(problem, threshold, rng)
+    found = [
+        run(task, lo_ransac(task, samples=samples), swap_refinement),
+        run(task, gnc(task, restarts=5), swap_refinement),
+    ]
+    if nets is not None:
+        found.append(run(task, learned(task, network=nets, rounds=rounds), swap_refinement))
+    best = max(found, key=lambda each: each.size)
+    return best.subset if best.subset is not None else np.zeros(problem.n_points, dtype=np.bool_)
+
+
+def random_settings(rng: np.random.Generator, recipe: Recipe) -> Settings:
+    """Return settings for a training fit: all that a user may meet, and exploration."""
+    return Settings(
+        samples=int(np.exp(rng.uniform(np.log(48), np.log(200)))),
+        refined=int(rng.integers(2, 7)),
+        local=float(rng.uniform(3.0, 6.0)),
+        reach=float(np.exp(rng.uniform(np.log(1.05), np.log(2.5)))),
+        power=float(rng.choice([1.0, 2.0, 3.0, 4.0])),
+        floor=float(np.exp(rng.uniform(np.log(0.001), np.log(0.01)))),
+        patience=int(rng.integers(3, 7)),
+        explore=recipe.explore,
+    )
+
+
+class Recorder:
+    """Plays fits with the present networks and keeps what these saw."""
+
+    def __init__(self) -> None:
+        self.points: list[NDArray[np.float64]] = []
+        self.points_right: list[NDArray[np.bool_]] = []
+        self.steps: list[NDArray[np.float32]] = []
+        self.steps_right: list[NDArray[np.float64]] = []
+
+    def fit(
+        self, task: Task, nets: SearchNetworks, label: NDArray[np.bool_], settings: Settings, rounds: int
+    ) -> tuple[int, int]:
+        """Play one fit; return the sizes of the label given and of the set found."""
+        arena = allocate_arena(task.rows, seed_state(task.rng), nets.points, nets.peel, LOG_STEPS)
+        search = carve(arena)
+        seen: list[tuple[NDArray[np.float64], NDArray[np.int64]]] = []
+        looks: list[tuple[NDArray[np.float64], NDArray[np.int64]]] = []
+        begin_search(arena, task.limit)
+        looks.append(self._look(search, task.rng))
+        while search.counts[ROUND] < rounds:
+            play_parts(arena, task.limit, settings, PROPOSE, WALK)
+            for part in range(WALK, BELIEVE):
+                walks = search.counts[WALKS]
+                play_parts(arena, task.limit, settings, part, part + 1)
+                if search.counts[WALKS] > walks:
+                    steps = min(int(search.counts[STEPS]), LOG_STEPS)
+                    seen.append((search.walk.log[:steps].copy(), search.walk.log_basis[:steps].copy()))
+            play_parts(arena, task.limit, settings, BELIEVE, SWAP)
+            looks.append(self._look(search, task.rng))
+            play_parts(arena, task.limit, settings, SWAP, PARTS)
+        finish_search(arena, task.limit)
+        known, found = int(label.sum()), int(search.member.sum())
+        right = search.member if found > known else label
+        for features, points in looks:
+            self.points.append(features)
+            self.points_right.append(right[points])
+        for features, basis in seen:
+            self._keep_steps(features, basis, right)
+        return known, found
+
+    @staticmethod
+    def _look(search: Search, rng: np.random.Generator) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+        N = search.member.shape[0]
+        points = rng.permutation(N)[:POINTS_KEPT]
+        return search.belief.features[:, points].T.copy(), points
+
+    def _keep_steps(self, features: NDArray[np.float64], basis: NDArray[np.int64], right: NDArray[np.bool_]) -> None:
+        n, wide = basis.shape[1], WIDEST_BASIS
+        padded = np.zeros((len(basis), wide, features.shape[2]), dtype=np.float32)
+        padded[:, :n] = np.where(basis[:, :, None] >= 0, features, 0.0)
+        outside = np.full((len(basis), wide), -1.0)
+        outside[:, :n] = np.where(basis >= 0, ~right[basis], -1.0)
+        self.steps.append(padded)
+        self.steps_right.append(outside)
+
+    def records(self) -> Records:
+        """Return all that was kept."""
+        empty = [np.zeros((0, WIDEST_BASIS, N_PEEL_FEATURES), dtype=np.float32)]
+        return Records(
+            np.concatenate(self.points).astype(np.float32),
+            np.concatenate(self.points_right).astype(np.float32),
+            np.concatenate(self.steps or empty).astype(np.float32),
+            np.concatenate(self.steps_right or [np.zeros((0, WIDEST_BASIS))]).astype(np.float32),
+        )
+
+
+class Learner:
+    """The two networks in torch, their optimiser, and the way to and from `SearchNetworks`."""
+
+    def __init__(self, nets: SearchNetworks, recipe: Recipe) -> None:
+        torch = _torch()
+        self.recipe = recipe
+        self.points = _module(nets.points)
+        self.peel = _module(nets.peel)
+        parameters = [*self.points.parameters(), *self.peel.parameters()]
+        self.optimiser = torch.optim.Adam(parameters, lr=recipe.rate)
+
+    def networks(self) -> SearchNetworks:
+        """Return the networks as they stand."""
+        return SearchNetworks(_plain(self.points), _plain(self.peel))
+
+    def learn(self, records: Sequence[Records], progress: float, rng: np.random.Generator) -> tuple[float, float]:
+        """Make the updates of a round, `progress` of the way through training; return both mean losses."""
+        torch = _torch()
+        recipe = self.recipe
+        rate = recipe.rate * (recipe.last_rate / recipe.rate) ** progress
+        for group in self.optimiser.param_groups:
+            group["lr"] = rate
+        X = torch.from_numpy(np.concatenate([each.points for each in records]))
+        y = torch.from_numpy(np.concatenate([each.points_right for each in records]))
+        S = torch.from_numpy(np.concatenate([each.steps for each in records]))
+        z = torch.from_numpy(np.concatenate([each.steps_right for each in records]))
+        totals = np.zeros(2)
+        for _ in range(recipe.updates):
+            some = torch.from_numpy(rng.integers(len(X), size=recipe.batch_points))
+            loss = point_loss(self.points(X[some]).squeeze(-1), y[some])
+            totals[0] += loss.item()
+            if len(S):
+                some = torch.from_numpy(rng.integers(len(S), size=recipe.batch_steps))
+                other = peel_loss(self.peel(S[some]).squeeze(-1), z[some])
+                totals[1] += other.item()
+                loss = loss + other
+            self.optimiser.zero_grad()
+            loss.backward()  # type: ignore[no-untyped-call]
+            self.optimiser.step()
+        means = totals / recipe.updates
+        return float(means[0]), float(means[1])
+
+
+def point_loss(logit: torch.Tensor, right: torch.Tensor) -> torch.Tensor:
+    """Return the binary cross entropy of the point network."""
+    loss: torch.Tensor = _torch().nn.functional.binary_cross_entropy_with_logits(logit, right)
+    return loss
+
+
+def peel_loss(logit: torch.Tensor, outside: torch.Tensor) -> torch.Tensor:
+    """Return half the binary cross entropy, and that of the choice; `outside` is -1 in empty slots."""
+    there = outside >= 0
+    total: torch.Tensor = 0.5 * point_loss(logit[there], outside[there])
+    everything = logit.masked_fill(~there, -1e9).logsumexp(dim=1)
+    chosen = logit.masked_fill(outside != 1, -1e9).logsumexp(dim=1)
+    open_choice = (outside == 1).any(dim=1) & (outside == 0).any(dim=1)
+    choice = (everything - chosen)[open_choice]
+    return total + choice.mean() if len(choice) else total
+
+
+def train_search_networks(
+    out: str | Path,
+    *,
+    seed: int = 0,
+    families: Sequence[str] = FAMILIES,
+    rounds: int = 40,
+    resume: bool = True,
+    recipe: Recipe | None = None,
+    judge_every: int = 10,
+    progress: Callable[[TrainingProgress], object] | None = None,
+) -> SearchNetworks:
+    """Train a pair of networks for the learned search by self-imitation.
+
+    Parameters
+    ----------
+    out
+        A folder: ``search.safetensors`` there is the pair after the last round, ``checkpoint.pt`` all that is
+        needed to go on. Both are replaced atomically after each round.
+    seed
+        Seeds everything: the same seed makes the same networks, on the same machine.
+    families
+        Which families of `FAMILIES` are trained on.
+    rounds
+        How many rounds are made in all.
+    resume
+        Go on from a checkpoint in `out`, if there is one of the same seed, families, rounds and recipe.
+    recipe
+        All other settings; None for the defaults.
+    judge_every
+        After so many rounds, and after the last, the mean gap on held-out problems is measured; 0 for never.
+    progress
+        Called after each round; a true return value stops the training there, to be resumed.
+
+    Returns
+    -------
+    SearchNetworks
+        The pair as it stands.
+
+    Raises
+    ------
+    ValueError
+        If `rounds` is less than 1, or a family is unknown, or the checkpoint belongs to another training.
+    ImportError
+        If torch is not installed: the extra "train" brings it.
+    """
+    recipe = Recipe() if recipe is None else recipe
+    if rounds < 1:
+        raise ValueError(f"rounds must be at least 1, but it is {rounds}")
+    unknown = sorted(set(families) - set(FAMILIES))
+    if unknown or not families:
+        raise ValueError(f"families must be some of {', '.join(FAMILIES)}, but they are {list(families)}")
+    folder = Path(out)
+    folder.mkdir(parents=True, exist_ok=True)
+    described = json.dumps(
+        {"seed": seed, "families": list(families), "rounds": rounds, "recipe": asdict(recipe)}, sort_keys=True
+    )
+    start_rng = np.random.default_rng([seed, 0])
+    first = SearchNetworks(
+        random_perceptron((N_POINT_FEATURES, *recipe.point_widths, 1), start_rng),
+        random_perceptron((N_PEEL_FEATURES, *recipe.peel_widths, 1), start_rng),
+    )
+    learner = Learner(first, recipe)
+    kept: deque[Records] = deque(maxlen=recipe.replayed)
+    done, seconds = 0, 0.0
+    if resume:
+        done, seconds = _restore(folder, described, learner, kept)
+    began = time.perf_counter() - seconds
+    while done < rounds:
+        rng = np.random.default_rng([seed, 1, done])
+        records, gained = _play_round(learner.networks(), families, recipe, rng)
+        kept.append(records)
+        losses = learner.learn(list(kept), done / max(rounds - 1, 1), rng)
+        done += 1
+        judged = judge_every > 0 and (done == rounds or done % judge_every == 0)
+        held_out = held_out_gaps(learner.networks(), families) if judged else None
+        seconds = time.perf_counter() - began
+        save_search_networks(learner.networks(), folder / "search.safetensors", {"training": described})
+        _keep(folder, described, learner, kept, done, seconds)
+        if progress is not None and progress(TrainingProgress(done, rounds, *losses, gained, seconds, held_out)):
+            break
+    return learner.networks()
+
+
+def _play_round(
+    nets: SearchNetworks, families: Sequence[str], recipe: Recipe, rng: np.random.Generator
+) -> tuple[Records, float]:
+    recorder = Recorder()
+    gained = 0
+    for _ in range(recipe.fits):
+        problem, threshold = draw_problem(families, rng, recipe.ranges)
+        label = best_known(problem, threshold, recipe.samples, rng, nets, recipe.label_rounds)
+        task = make_task(problem, threshold, rng)
+        rounds = int(rng.integers(recipe.play_rounds[0], recipe.play_rounds[1] + 1))
+        known, found = recorder.fit(task, nets, label, random_settings(rng, recipe), rounds)
+        gained += found - known
+    return recorder.records(), gained / recipe.fits
+
+
+#: Held-out cells: family, N, outlier rate. Hard enough that networks differ.
+HELD_OUT = (
+    ("line", 100, 0.9),
+    ("plane", 100, 0.85),
+    ("hyperplane", 100, 0.75),
+    ("fundamental", 100, 0.6),
+    ("fundamental-F32", 100, 0.6),
+)
+
+
+def held_out_gaps(
+    nets: SearchNetworks, families: Sequence[str], instances: int = 24, budget: float = 0.003
+) -> dict[str, float]:
+    """Return the mean lack of inliers at a fixed time, by family, against 30 times that time and the classics."""
+    gaps = {}
+    for family, n_points, rate in HELD_OUT:
+        if family not in families:
+            continue
+        lacks = []
+        for number in range(instances):
+            problem, threshold = make_problem(family, np.random.default_rng([number, 77]), n_points, rate)
+            known = int(best_known(problem, threshold, 2000, np.random.default_rng(number), None, 0).sum())
+            sizes = []
+            for limit in (budget, 30 * budget):
+                task = make_task(problem, threshold, np.random.default_rng(number), limit)
+                sizes.append(run(task, learned(task, network=nets), swap_refinement).size)
+            lacks.append(max(known, sizes[1]) - sizes[0])
+        gaps[family] = float(np.mean(lacks))
+    return gaps
+
+
+def _torch() -> Any:
+    try:
+        import torch  # noqa: PLC0415
+    except ImportError as error:  # pragma: no cover - the tests run with the extra
+        raise ImportError("training needs torch: pip install 'maxcon[train]'") from error
+    return torch
+
+
+def _module(net: Perceptron) -> Any:
+    torch = _torch()
+    parts: list[Any] = []
+    for matrix, bias in layers(net):
+        linear = torch.nn.Linear(*matrix.shape)
+        with torch.no_grad():
+            linear.weight.copy_(torch.from_numpy(matrix.T))
+            linear.bias.copy_(torch.from_numpy(bias))
+        parts += [linear, torch.nn.LeakyReLU(LEAK)]
+    return torch.nn.Sequential(*parts[:-1])
+
+
+def _plain(module: Any) -> Perceptron:
+    linear = [part for part in module if hasattr(part, "weight")]
+    return perceptron(
+        [part.weight.detach().numpy().T.astype(np.float64) for part in linear],
+        [part.bias.detach().numpy().astype(np.float64) for part in linear],
+    )
+
+
+def _keep(folder: Path, described: str, learner: Learner, kept: deque[Records], done: int, seconds: float) -> None:
+    torch = _torch()
+    state = {
+        "described": described,
+        "done": done,
+        "seconds": seconds,
+        "points": learner.points.state_dict(),
+        "peel": learner.peel.state_dict(),
+        "optimiser": learner.optimiser.state_dict(),
+        "records": [{name: torch.from_numpy(value) for name, value in vars(each).items()} for each in kept],
+    }
+    part = folder / "checkpoint.part"
+    torch.save(state, part)
+    os.replace(part, folder / "checkpoint.pt")
+
+
+def _restore(folder: Path, described: str, learner: Learner, kept: deque[Records]) -> tuple[int, float]:
+    torch = _torch()
+    path = folder / "checkpoint.pt"
+    if not path.exists():
+        return 0, 0.0
+    state = torch.load(path, weights_only=True)
+    if state["described"] != described:
+        raise ValueError(
+            f"out must be a folder of the same training, or hold none, but {str(path)!r} belongs to "
+            f"{state['described']}: pass resume=False to start anew"
+        )
+    learner.points.load_state_dict(state["points"])
+    learner.peel.load_state_dict(state["peel"])
+    learner.optimiser.load_state_dict(state["optimiser"])
+    kept.extend(Records(**{name: value.numpy() for name, value in each.items()}) for each in state["records"])
+    return int(state["done"]), float(state["seconds"])

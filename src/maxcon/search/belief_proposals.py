@@ -1,0 +1,235 @@
+"""Models to start from: minimal samples drawn from the belief, ranked, the best of them refined."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from maxcon.minimax.jit import kernel
+from maxcon.minimax.linear import compute_residuals
+from maxcon.search.belief import RAW, SHARP, SHRINK, SOFT, Belief, cast_vote, nearness
+from maxcon.search.gnc_kernels import descend
+from maxcon.search.model_kernels import count_within, eliminate_point, substitute_back
+from maxcon.search.random_kernels import draw_next, random_unit
+from maxcon.search.sampling_kernels import Scratch
+
+#: From so many points on, samples are ranked on `FEW` random ones first.
+MANY, FEW = 400, 256
+
+#: How many samples are kept by rank, and of these, how many are refined.
+KEPT = 8
+
+
+class Proposals(NamedTuple):
+    """The proposals of a round.
+
+    Attributes
+    ----------
+    models, scores
+        Shapes (KEPT, r) and (KEPT,): best first; scores are soft counts of points.
+    cumulative
+        Shape (N,): running sums of the weights of the draw.
+    few_rows, few_b, few_r
+        Shapes (r, m), (m,), (m,): the random points that samples are ranked on, m = 0 where all are.
+    best
+        Shape (r,): scratch space of the refinement.
+    """
+
+    models: NDArray[np.float64]
+    scores: NDArray[np.float64]
+    cumulative: NDArray[np.float64]
+    few_rows: NDArray[np.float64]
+    few_b: NDArray[np.float64]
+    few_r: NDArray[np.float64]
+    best: NDArray[np.float64]
+
+
+@kernel
+def accumulate_weights(p: NDArray[np.float64], power: float, floor: float, cumulative: NDArray[np.float64]) -> None:
+    """Write the running sums of the weights of the draw, p^power + floor."""
+    total = 0.0
+    for i in range(p.shape[0]):
+        total += p[i] ** power + floor
+        cumulative[i] = total
+
+
+@kernel
+def draw_weighted(cumulative: NDArray[np.float64], state: NDArray[np.int64]) -> int:
+    """Draw a point with the probability of its share of the running sums (bisection)."""
+    last = cumulative.shape[0] - 1
+    target = random_unit(state) * cumulative[last]
+    low, high = 0, last
+    while low < high:
+        middle = (low + high) >> 1
+        if cumulative[middle] > target:
+            high = middle
+        else:
+            low = middle + 1
+    return low
+
+
+@kernel
+def sample_model(
+    At: NDArray[np.float64],
+    b: NDArray[np.float64],
+    cumulative: NDArray[np.float64],
+    state: NDArray[np.int64],
+    table: NDArray[np.float64],
+    places: NDArray[np.int64],
+    x: NDArray[np.float64],
+) -> None:
+    """Write into x the model through r independent points drawn by weight, as `minimal_model` does uniformly.
+
+    A point drawn again depends on itself, and is passed over like any other that depends on those before it.
+    """
+    d = At.shape[0]
+    for j in range(d):
+        places[j] = j
+    rank = 0
+    for _ in range(4 * d + 16):
+        if rank == d:
+            break
+        if eliminate_point(At, b, draw_weighted(cumulative, state), rank, table, places):
+            rank += 1
+    substitute_back(rank, table, places, x)
+
+
+@kernel
+def keep_best(models: NDArray[np.float64], scores: NDArray[np.float64], x: NDArray[np.float64], score: float) -> None:
+    """Insert model x by its score, the worst one falls out."""
+    last = scores.shape[0] - 1
+    if score <= scores[last]:
+        return
+    place = last
+    while place > 0 and scores[place - 1] < score:
+        scores[place] = scores[place - 1]
+        for j in range(x.shape[0]):
+            models[place, j] = models[place - 1, j]
+        place -= 1
+    scores[place] = score
+    for j in range(x.shape[0]):
+        models[place, j] = x[j]
+
+
+@kernel
+def _choose_few(
+    At: NDArray[np.float64],
+    b: NDArray[np.float64],
+    few_rows: NDArray[np.float64],
+    few_b: NDArray[np.float64],
+    pool: NDArray[np.int64],
+    state: NDArray[np.int64],
+) -> None:
+    d, N = At.shape
+    for m in range(few_b.shape[0]):
+        i = draw_next(state, pool, m, N)
+        few_b[m] = b[i]
+        for j in range(d):
+            few_rows[j, m] = At[j, i]
+
+
+@kernel
+def propose(
+    At: NDArray[np.float64],
+    b: NDArray[np.float64],
+    limit: float,
+    samples: int,
+    power: float,
+    floor: float,
+    belief: Belief,
+    proposals: Proposals,
+    scratch: Scratch,
+) -> None:
+    """Draw samples from the belief, rank them, keep the best `KEPT`, and let them vote."""
+    x, r = scratch.x, scratch.r
+    state, table, places = scratch.state, scratch.table, scratch.places
+    votes, totals, tops = belief.votes, belief.totals, belief.tops
+    models, scores, cumulative = proposals.models, proposals.scores, proposals.cumulative
+    few_rows, few_b, few_r = proposals.few_rows, proposals.few_b, proposals.few_r
+    few = few_b.shape[0] > 0
+    accumulate_weights(belief.p, power, floor, cumulative)
+    for k in range(KEPT):
+        scores[k] = -1.0
+    if few:
+        _choose_few(At, b, few_rows, few_b, scratch.pool, state)
+    for _ in range(samples):
+        sample_model(At, b, cumulative, state, table, places, x)
+        if few:
+            compute_residuals(few_rows, few_b, x, few_r)
+            keep_best(models, scores, x, nearness(few_r, limit, few_r))
+        else:
+            compute_residuals(At, b, x, r)
+            score = nearness(r, limit, r)
+            keep_best(models, scores, x, score)
+            cast_vote(votes, totals, tops, RAW, score, r)
+    if few:
+        for k in range(KEPT):
+            if scores[k] >= 0.0:
+                compute_residuals(At, b, models[k], r)
+                score = nearness(r, limit, r)
+                cast_vote(votes, totals, tops, RAW, score, r)
+
+
+@kernel
+def refine_proposals(
+    At: NDArray[np.float64],
+    b: NDArray[np.float64],
+    limit: float,
+    count: int,
+    local: float,
+    belief: Belief,
+    proposals: Proposals,
+    scratch: Scratch,
+    best: NDArray[np.float64],
+    size: int,
+) -> int:
+    """Move the best `count` proposals to a local minimum of the loss, rank them again, let them vote.
+
+    `best` takes any model met that explains more than `size` points; returns the new size.
+    """
+    d = At.shape[0]
+    models, scores, x = proposals.models, proposals.scores, scratch.trial
+    count = min(count, KEPT)
+    for k in range(count):
+        if scores[k] < 0.0:
+            count = k
+            break
+    for k in range(count):
+        for j in range(d):
+            x[j] = models[k, j]
+        found, _ = descend(At, b, limit, local * local, SHRINK, 1000, scratch, x, proposals.best, -1)
+        if found > size:
+            size = found
+            for j in range(d):
+                best[j] = proposals.best[j]
+        for j in range(d):
+            models[k, j] = x[j]
+        count_there = count_within(scratch.r, limit)
+        scores[k] = nearness(scratch.r, limit, scratch.r)
+        cast_vote(belief.votes, belief.totals, belief.tops, SOFT, scores[k], scratch.r)
+        cast_vote(belief.votes, belief.totals, belief.tops, SHARP, float(count_there), scratch.r)
+    for k in range(1, count):  # by score, best first
+        m = k
+        while m > 0 and scores[m - 1] < scores[m]:
+            scores[m - 1], scores[m] = scores[m], scores[m - 1]
+            for j in range(d):
+                models[m - 1, j], models[m, j] = models[m, j], models[m - 1, j]
+            m -= 1
+    for k in range(count, KEPT):
+        scores[k] = -1.0
+    return size
+
+
+@kernel
+def same_model(x: NDArray[np.float64], y: NDArray[np.float64], distance: float) -> bool:
+    """Return whether the residuals of two models differ by less than `distance`, root mean square.
+
+    The columns of whitened rows are orthogonal and of length sqrt(N): the distance of the models is that of
+    their residuals.
+    """
+    total = 0.0
+    for j in range(x.shape[0]):
+        total += (x[j] - y[j]) ** 2
+    return total < distance * distance

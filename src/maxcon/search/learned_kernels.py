@@ -1,0 +1,349 @@
+"""Kernels of the learned search: the root, one round of it, and its parts by number.
+
+A round: propose from the belief, walk down from the best proposals and from the incumbent, update the belief, and
+where that agrees with the incumbent, swap. All parts share `Search`, allocated once a fit.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from maxcon.agent.point_features import write_best_features
+from maxcon.minimax.jit import kernel
+from maxcon.minimax.linear import OK, cold_fit, compute_residuals
+from maxcon.problem.validate import check_number
+from maxcon.search.belief import agreement, forget_votes, root_models, start_belief, update_belief
+from maxcon.search.belief_proposals import KEPT, propose, refine_proposals, same_model
+from maxcon.search.learned_memory import (
+    AGREEMENT,
+    DOUBTS,
+    MEMORY,
+    PLACED,
+    ROUND,
+    SIZE,
+    STALL,
+    STEPS,
+    SWAPPED,
+    WALKED,
+    WALKS,
+    Arena,
+    Search,
+    carve,
+)
+from maxcon.search.model_kernels import count_within
+from maxcon.search.peel_walk import choose_start, install_walk, walk_down
+from maxcon.search.refine_kernels import refine_kernel, swap_kernel
+from maxcon.search.vertex_kernels import load_vertex, save_vertex
+
+#: The parts of a round, in order; walks 0 and 1 start from proposals, 2 from the incumbent.
+PROPOSE, WALK, BELIEVE, SWAP, PARTS = 0, 1, 4, 5, 6
+
+#: Two starts are the same where their residuals differ by less than this many limits, root mean square.
+SAME_START = 0.1
+
+
+#: A walk is not begun where its set would have to grow by more than this to be worth it.
+FEW_MORE = 3
+
+
+class Settings(NamedTuple):
+    """The settings of a round.
+
+    Attributes
+    ----------
+    samples
+        How many minimal samples are drawn.
+    refined
+        How many of them are refined, at most `KEPT`.
+    local
+        The refinement starts where residuals of this many limits still count.
+    power, floor
+        A point with belief p is drawn with a weight of p^power + floor.
+    soften
+        After s rounds without progress the power is divided by 1 + soften s: what the belief favours has been
+        tried by then.
+    reach
+        A walk starts from the points within so many limits of its proposal.
+    patience
+        Rounds without progress after which the votes are forgotten.
+    agreed
+        The mean belief in the incumbent's points from which on it is swapped, one round later.
+    explore
+        How often a walk removes a random basis point; for training.
+    """
+
+    samples: int = 100
+    refined: int = 4
+    local: float = 4.0
+    power: float = 3.0
+    soften: float = 0.3
+    floor: float = 0.003
+    reach: float = 1.2
+    patience: int = 5
+    agreed: float = 0.85
+    explore: float = 0.0
+
+
+#: The least and the largest value of each setting.
+_RANGES = {
+    "samples": (1, 2**31 - 1),
+    "refined": (1, KEPT),
+    "local": (1.0, 1e3),
+    "power": (0.0, 100.0),
+    "soften": (0.0, 1e3),
+    "floor": (1e-12, 1.0),
+    "reach": (1.0, 1e6),
+    "patience": (1, 2**31 - 1),
+    "agreed": (0.0, 2.0),
+    "explore": (0.0, 1.0),
+}
+
+
+def check_settings(settings: Settings) -> Settings:
+    """Return the settings with plain numbers.
+
+    Raises
+    ------
+    TypeError
+        If they are no `Settings`, or one is not a number of its kind.
+    ValueError
+        If one is out of its range.
+    """
+    if not isinstance(settings, Settings):
+        raise TypeError(f"settings must be Settings, but it is a {type(settings).__name__}")
+    checked: dict[str, Any] = {}
+    for name, value in settings._asdict().items():
+        whole = isinstance(getattr(Settings(), name), int)
+        low, high = _RANGES[name]
+        if whole and (isinstance(value, bool) or not isinstance(value, (int, np.integer))):
+            raise TypeError(f"settings.{name} must be an integer, but it is {value!r}")
+        number = int(value) if whole else check_number(value, f"settings.{name}")
+        if not low <= number <= high:
+            raise ValueError(f"settings.{name} must be between {low} and {high}, but it is {value}")
+        checked[name] = number
+    return Settings(**checked)
+
+
+@kernel
+def take_model(search: Search, limit: float) -> None:
+    """Make the points that model ``search.x`` explains the incumbent."""
+    r, member, counts = search.scratch.r, search.member, search.counts
+    compute_residuals(search.ws.At, search.ws.b, search.x, r)
+    counts[SIZE] = 0
+    for i in range(r.shape[0]):
+        member[i] = abs(r[i]) <= limit
+        counts[SIZE] += member[i]
+    counts[PLACED] = 0
+    _note_progress(search, limit, r)
+
+
+@kernel
+def take_vertex(search: Search, limit: float, size: int) -> None:
+    """Make the set in the workspace, of `size` points and at its vertex, the incumbent."""
+    ws = search.ws
+    for i in range(ws.r.shape[0]):
+        search.member[i] = ws.gain[i] == 1.0
+    for j in range(search.x.shape[0]):
+        search.x[j] = ws.x[j]
+    save_vertex(ws, search.vertex, 0)
+    search.counts[SIZE] = size
+    search.counts[PLACED] = 1
+    _note_progress(search, limit, ws.r)
+
+
+@kernel
+def _note_progress(search: Search, limit: float, r: NDArray[np.float64]) -> None:
+    counts = search.counts
+    counts[STALL] = -1  # the end of the round makes it 0
+    counts[SWAPPED] = 0
+    counts[WALKED] = 0
+    write_best_features(r, search.member, limit, search.belief.bins, search.belief.features)
+
+
+@kernel
+def begin(search: Search, limit: float) -> None:
+    """Do the root: the two models of all points, the first incumbent, the first belief."""
+    ws, counts = search.ws, search.counts
+    for i in range(ws.b.shape[0]):
+        search.scratch.pool[i] = i
+        search.belief.p[i] = 0.5
+        for k in range(search.refinement.certificate.shape[1]):
+            search.refinement.certificate[i, k] = -1
+    for k in range(MEMORY):
+        for j in range(search.x.shape[0]):
+            search.starts[k, j] = np.inf
+    root_models(ws.At, ws.b, limit, search.scratch, search.l1, search.gnc)
+    start_belief(ws.At, ws.b, limit, search.scratch, search.l1, search.gnc, search.belief)
+    for j in range(search.x.shape[0]):
+        search.x[j] = search.gnc[j]
+    take_model(search, limit)
+    counts[STALL] = 0
+    update_belief(search.point_net, 0, search.belief)
+
+
+@kernel
+def walk_from(search: Search, limit: float, settings: Settings, x: NDArray[np.float64]) -> None:
+    """Walk down from model x, add back, and keep what was found if it is more than the incumbent."""
+    ws, walk, counts, r = search.ws, search.walk, search.counts, search.trial
+    N = r.shape[0]
+    compute_residuals(ws.At, ws.b, x, r)
+    inside = count_within(r, limit)
+    m = choose_start(r, settings.reach * limit, walk.points)
+    if m + FEW_MORE < counts[SIZE]:
+        return
+    status, removed = walk_down(
+        ws.At,
+        ws.b,
+        limit,
+        search.peel_net,
+        m,
+        r,
+        inside / N,
+        settings.explore,
+        search.belief,
+        search.scratch.state,
+        walk,
+    )
+    counts[WALKS] += 1
+    counts[STEPS] = removed
+    if status != OK:
+        return
+    install_walk(ws, m, walk)
+    size = count_within(ws.r, limit)
+    if 10 * size < 9 * counts[SIZE] - 10:  # too far off for a few more points to matter
+        return
+    for i in range(N):
+        search.refinement.tried[i] = False
+    size = m - removed + refine_kernel(ws, limit, search.refinement)
+    if size > counts[SIZE]:
+        take_vertex(search, limit, size)
+
+
+@kernel
+def _is_new_start(search: Search, limit: float, x: NDArray[np.float64]) -> bool:
+    for k in range(MEMORY):
+        if same_model(search.starts[k], x, SAME_START * limit):
+            return False
+    place = search.counts[WALKS] % MEMORY
+    for j in range(x.shape[0]):
+        search.starts[place, j] = x[j]
+    return True
+
+
+@kernel
+def walk_part(search: Search, limit: float, settings: Settings, which: int) -> None:
+    """Walk from proposal 0 or 1, or (2) from the incumbent, unless that has been done."""
+    if which < 2:
+        proposals, best = search.proposals, -1
+        for k in range(KEPT):
+            if proposals.scores[k] >= 0.0:
+                proposals.scores[k] = -1.0
+                if _is_new_start(search, limit, proposals.models[k]):
+                    best = k
+                    break
+        if best >= 0:
+            walk_from(search, limit, settings, proposals.models[best])
+    elif not search.counts[WALKED]:
+        search.counts[WALKED] = 1
+        walk_from(search, limit, settings, search.x)
+
+
+@kernel
+def propose_part(search: Search, limit: float, settings: Settings) -> None:
+    """Draw and refine proposals; a model that explains more than the incumbent replaces it."""
+    ws, belief, scratch = search.ws, search.belief, search.scratch
+    power = settings.power / (1.0 + settings.soften * max(search.counts[STALL], 0))
+    propose(ws.At, ws.b, limit, settings.samples, power, settings.floor, belief, search.proposals, scratch)
+    size = search.counts[SIZE]
+    found = refine_proposals(
+        ws.At,
+        ws.b,
+        limit,
+        settings.refined,
+        settings.local,
+        belief,
+        search.proposals,
+        scratch,
+        search.x,
+        size,
+    )
+    if found > size:
+        take_model(search, limit)
+
+
+@kernel
+def place_incumbent(search: Search, limit: float) -> bool:
+    """Put the incumbent's set and vertex into the workspace; False if rounding stands against it."""
+    ws, counts = search.ws, search.counts
+    for i in range(ws.gain.shape[0]):
+        ws.gain[i] = 1.0 if search.member[i] else 0.0
+        ws.cap[i] = 0.0 if search.member[i] else np.inf
+    if counts[PLACED]:
+        load_vertex(ws, search.vertex, 0)
+        return True
+    return cold_fit(*ws) == OK and ws.x[ws.x.shape[0] - 1] <= limit
+
+
+@kernel
+def swap_part(search: Search, limit: float) -> None:
+    """Refine and swap the incumbent, unless that has been done."""
+    counts = search.counts
+    if counts[SWAPPED] or counts[SIZE] == 0:
+        return
+    if place_incumbent(search, limit):
+        gained = swap_kernel(search.ws, limit, search.refinement)
+        if gained > 0:
+            take_vertex(search, limit, counts[SIZE] + gained)
+    counts[SWAPPED] = 1
+
+
+@kernel
+def play(search: Search, limit: float, settings: Settings, first: int, last: int) -> None:
+    """Do the parts `first` to ``last - 1`` of a round; the round is over after its last part."""
+    counts = search.counts
+    for part in range(first, last):
+        if part == PROPOSE:
+            propose_part(search, limit, settings)
+        elif part < BELIEVE:
+            walk_part(search, limit, settings, part - WALK)
+        elif part == BELIEVE:
+            counts[ROUND] += 1
+            update_belief(search.point_net, counts[ROUND], search.belief)
+            agreed, doubts = agreement(search.belief.p, search.member)
+            counts[AGREEMENT] = int(1000.0 * agreed)
+            counts[DOUBTS] = doubts
+        elif counts[STALL] > 0 and counts[AGREEMENT] > 1000.0 * settings.agreed:
+            swap_part(search, limit)
+    if last == PARTS:
+        counts[STALL] += 1
+        if counts[STALL] > 0 and counts[STALL] % settings.patience == 0:
+            forget_votes(search.belief)
+
+
+@kernel
+def begin_search(arena: Arena, limit: float) -> None:
+    """Do the root."""
+    begin(carve(arena), limit)
+
+
+@kernel
+def play_parts(arena: Arena, limit: float, settings: Settings, first: int, last: int) -> None:
+    """Do some parts of a round, for those who look at what comes between."""
+    play(carve(arena), limit, settings, first, last)
+
+
+@kernel
+def play_rounds(arena: Arena, limit: float, settings: Settings, rounds: int) -> None:
+    """Do whole rounds."""
+    search = carve(arena)
+    for _ in range(rounds):
+        play(search, limit, settings, PROPOSE, PARTS)
+
+
+@kernel
+def finish_search(arena: Arena, limit: float) -> None:
+    """Refine and swap the incumbent for the last time."""
+    swap_part(carve(arena), limit)

@@ -1,0 +1,226 @@
+"""A walk down the tree from a proposal: the peel network says which basis point to remove, until the rest fits.
+
+The set S that the walk starts from holds the points near the proposal only, and the walk's fits see no others:
+they work on copies of the rows of S, side by side in memory.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from maxcon.agent.peel_features import write_peel_features
+from maxcon.agent.perceptron import Perceptron, evaluate_row
+from maxcon.minimax import Workspace
+from maxcon.minimax.jit import kernel
+from maxcon.minimax.linear import (
+    FAILED,
+    OK,
+    basis_multipliers,
+    basis_points,
+    cold_fit,
+    compute_residuals,
+    refit_after_removal,
+)
+from maxcon.search.belief import Belief
+from maxcon.search.random_kernels import random_below, random_unit
+
+
+class Walk(NamedTuple):
+    """Room for the rows of S, its vertex, and the network's inputs.
+
+    Attributes
+    ----------
+    points
+        Shape (N,): ``points[:m]`` are the points of S.
+    At, b, gain, cap, r, work, table, C, x, q
+        The parts of a `Workspace` of up to N points, flat where their shape depends on m.
+    basis, named, multipliers, sides, features, hidden
+        Shapes (d + 1,), ..., (d + 1, 12), (2, W): one step; `basis` are places in `points`, `named` the
+        points there.
+    log, log_basis
+        Shapes (L, d + 1, 12) and (L, d + 1): the first L steps of the walk, as the network saw them; L = 0 keeps
+        none.
+    """
+
+    points: NDArray[np.int64]
+    At: NDArray[np.float64]
+    b: NDArray[np.float64]
+    gain: NDArray[np.float64]
+    cap: NDArray[np.float64]
+    r: NDArray[np.float64]
+    work: NDArray[np.float64]
+    table: NDArray[np.float64]
+    C: NDArray[np.float64]
+    x: NDArray[np.float64]
+    q: NDArray[np.int64]
+    basis: NDArray[np.int64]
+    named: NDArray[np.int64]
+    multipliers: NDArray[np.float64]
+    sides: NDArray[np.float64]
+    features: NDArray[np.float64]
+    hidden: NDArray[np.float64]
+    log: NDArray[np.float64]
+    log_basis: NDArray[np.int64]
+
+
+@kernel
+def choose_start(r: NDArray[np.float64], reach: float, points: NDArray[np.int64]) -> int:
+    """Write the points with residuals up to `reach` into `points`; return how many there are."""
+    m = 0
+    for i in range(r.shape[0]):
+        if abs(r[i]) <= reach:
+            points[m] = i
+            m += 1
+    return m
+
+
+@kernel
+def _copy_rows(At: NDArray[np.float64], b: NDArray[np.float64], m: int, walk: Walk) -> Workspace:
+    """Return a workspace of the rows of ``walk.points[:m]``, all of them in the fit."""
+    d = At.shape[0]
+    rows = walk.At[: d * m].reshape(d, m)
+    points = walk.points
+    for j in range(d):
+        a, target = At[j], rows[j]
+        for k in range(m):
+            target[k] = a[points[k]]
+    for k in range(m):
+        walk.b[k] = b[points[k]]
+        walk.gain[k] = 1.0
+        walk.cap[k] = 0.0
+    return Workspace(
+        rows,
+        walk.b[:m],
+        walk.gain[:m],
+        walk.cap[:m],
+        walk.C,
+        walk.x,
+        walk.q,
+        walk.r[:m],
+        walk.work,
+        walk.table,
+    )
+
+
+@kernel
+def walk_down(
+    At: NDArray[np.float64],
+    b: NDArray[np.float64],
+    limit: float,
+    net: Perceptron,
+    m: int,
+    proposal: NDArray[np.float64],
+    proposal_share: float,
+    explore: float,
+    belief: Belief,
+    state: NDArray[np.int64],
+    walk: Walk,
+) -> tuple[int, int]:
+    """Remove basis points from the set ``walk.points[:m]`` until it is feasible.
+
+    Parameters
+    ----------
+    limit
+        Threshold plus slack, in the unit of the rows.
+    proposal, proposal_share
+        Shape (N,): the residuals of the model that the set comes from, and the share of its inliers.
+    explore
+        How often a basis point is removed at random (for training).
+    state
+        The random state, used only to explore.
+
+    Returns
+    -------
+    OK, or FAILED where a fit did; and how many points were removed. The vertex reached is in ``walk.C``,
+    ``walk.x``, ``walk.q`` (named by places in ``walk.points``) with ``walk.gain[:m]`` 1 for the points kept.
+    """
+    wAt, wb, gain, cap, C, x, q, r, work, table = _copy_rows(At, b, m, walk)
+    points, basis, named, multipliers, sides = walk.points, walk.basis, walk.named, walk.multipliers, walk.sides
+    features, hidden, logit, known = walk.features, walk.hidden, belief.logit, belief.features
+    n = x.shape[0]
+    if m == 0 or cold_fit(wAt, wb, gain, cap, C, x, q, r, work, table) != OK:
+        return FAILED, 0
+    removed = 0
+    while x[n - 1] > limit:
+        size = basis_points(C, q, basis)
+        if size == 0:
+            return FAILED, removed
+        basis_multipliers(C, q, basis, multipliers)
+        for slot in range(size):
+            sides[slot] = 1.0 if r[basis[slot]] >= 0.0 else -1.0
+            named[slot] = points[basis[slot]]
+        share = (m - removed) / At.shape[1]
+        write_peel_features(
+            named,
+            size,
+            multipliers,
+            sides,
+            x[n - 1],
+            limit,
+            share,
+            proposal,
+            proposal_share,
+            logit,
+            known,
+            features,
+        )
+        if removed < walk.log.shape[0]:
+            _keep_log(features, named, size, walk.log[removed], walk.log_basis[removed])
+        slot = _best_row(net, features, size, hidden)
+        if explore > 0.0 and random_unit(state) < explore:
+            slot = random_below(state, size)
+        if refit_after_removal(wAt, wb, gain, cap, C, x, q, r, work, table, basis[slot]) != OK:
+            return FAILED, removed
+        removed += 1
+    return OK, removed
+
+
+@kernel
+def _best_row(net: Perceptron, features: NDArray[np.float64], size: int, hidden: NDArray[np.float64]) -> int:
+    """Return which of the first `size` rows has the largest logit."""
+    best = 0
+    most = -np.inf
+    for slot in range(size):
+        value = evaluate_row(net, features[slot], hidden)
+        if value > most:
+            most = value
+            best = slot
+    return best
+
+
+@kernel
+def _keep_log(
+    features: NDArray[np.float64],
+    named: NDArray[np.int64],
+    size: int,
+    log: NDArray[np.float64],
+    log_basis: NDArray[np.int64],
+) -> None:
+    for k in range(named.shape[0]):
+        log_basis[k] = named[k] if k < size else -1
+    for k in range(size):
+        for f in range(features.shape[1]):
+            log[k, f] = features[k, f]
+
+
+@kernel
+def install_walk(ws: Workspace, m: int, walk: Walk) -> None:
+    """Put the vertex that a walk reached, and its set, into a workspace of all points."""
+    n = ws.x.shape[0]
+    for i in range(ws.gain.shape[0]):
+        ws.gain[i] = 0.0
+        ws.cap[i] = np.inf
+    for k in range(m):
+        if walk.gain[k] == 1.0:
+            ws.gain[walk.points[k]] = 1.0
+            ws.cap[walk.points[k]] = 0.0
+    for j in range(n):
+        for k in range(n):
+            ws.C[j, k] = walk.C[j, k]
+        ws.x[j] = walk.x[j]
+        name = walk.q[j]
+        ws.q[j] = name if name < 0 else 2 * walk.points[name >> 1] + (name & 1)
+    compute_residuals(ws.At, ws.b, ws.x, ws.r)
