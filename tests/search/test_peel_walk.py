@@ -15,7 +15,7 @@ from maxcon.search.peel_walk import choose_start, install_walk, walk_down
 from maxcon.search.random_kernels import seed_state
 
 
-def walked(A, b, threshold, reach=np.inf, explore=0.0, log_steps=40, seed=0):
+def walked(A, b, threshold, reach=np.inf, explore=0.0, log_steps=40, seed=0, loyal=False):
     task = make_task(LinearProblem(A, b), threshold, np.random.default_rng(seed))
     nets = shipped_search_networks()
     arena = allocate_arena(task.rows, seed_state(task.rng), nets.points, nets.peel, log_steps)
@@ -24,8 +24,9 @@ def walked(A, b, threshold, reach=np.inf, explore=0.0, log_steps=40, seed=0):
     r = task.rows.b - task.rows.At.T @ search.x
     m = choose_start(r, reach * task.limit, search.walk.points)
     start = search.walk.points[:m].copy()
-    args = (task.rows.At, task.rows.b, task.limit, nets.peel, m, r, 0.5, explore, search.belief, search.scratch.state)
-    status, removed = walk_down(*args, search.walk)
+    kept = np.zeros(0, dtype=bool) if not loyal else search.member
+    args = (task.rows.At, task.rows.b, task.limit, nets.peel, m, r, 0.5, explore, kept, search.belief)
+    status, removed = walk_down(*args, search.scratch.state, search.walk)
     return task, search, start, status, removed
 
 
@@ -81,6 +82,17 @@ def test_each_step_removes_a_point_of_the_basis_that_it_logs():
                 break
         else:
             pytest.fail("no point of the logged basis leads to the next")
+
+
+@pytest.mark.parametrize("name", ["synthetic_some", "quantised", "duplicate_a", "uniform_noise", "leverage_outliers"])
+def test_a_loyal_walk_keeps_the_incumbent(name):
+    for seed in range(4):
+        A, b = BUILDERS[name](np.random.default_rng([seed, 6]), 40, 3)
+        _, search, start, status, removed = walked(A, b, 0.3, reach=20.0, loyal=True)
+        assert status == OK
+        install_walk(search.ws, len(start), search.walk)
+        assert (search.ws.gain == 1.0)[search.member].all()
+        assert removed + search.member.sum() <= len(start)
 
 
 def test_exploring_walks_are_seeded():

@@ -23,6 +23,7 @@ from maxcon.cli.errors import Failure, reported
 from maxcon.cli.interrupt import deferred
 from maxcon.cli.output import check_folder
 from maxcon.cli.present import console
+from maxcon.cli.train_search import LEARNERS, check_learner, train_search
 
 if TYPE_CHECKING:
     from maxcon.agent.learn import Learner
@@ -30,6 +31,9 @@ if TYPE_CHECKING:
 
 #: Parameters of the models of each family.
 N_PARAMS = {"line": 2, "plane": 3, "fundamental": 8}
+
+#: Rounds that the shipped networks of the learned search were trained for.
+SEARCH_ROUNDS = 120
 
 #: Settings that have an option or argument of their own.
 _FIXED = {"n_params": "FAMILY", "seed": "--seed", "updates": "--updates", "source": "--data", "started_from": "--from"}
@@ -44,9 +48,16 @@ class _HeldOut(NamedTuple):
 
 
 @click.command(name="train", short_help="Train an agent.")
-@click.argument("family", type=click.Choice(list(N_PARAMS)))
+@click.argument("family", type=click.Choice([*N_PARAMS, "search"]))
+@click.option(
+    "--learner",
+    "teacher",
+    type=click.Choice(LEARNERS),
+    help="What teaches: the paper's DQN; for the search, imitation of the best sets known, or of proven optima.  "
+    "[default: dqn; for the search self-imitation]",
+)
 @click.option("--seed", type=click.IntRange(min=0), help="Seeds everything.  [default: 0]")
-@click.option("--updates", type=click.IntRange(min=1), help="How many gradient steps to make.")
+@click.option("--updates", type=click.IntRange(min=1), help="How many gradient steps to make; rounds for the search.")
 @click.option(
     "--minutes", type=click.FloatRange(min=0, min_open=True), help="Stop after so long; called again, it goes on."
 )
@@ -59,8 +70,11 @@ class _HeldOut(NamedTuple):
 @click.option(
     "--data",
     metavar="FOLDER",
-    help="Fundamental matrices from a KITTI odometry folder (matches of frame pairs) or from ModelNet40 (meshes).  "
-    "[default: made scenes]",
+    help="Fundamental matrices from a KITTI odometry folder (matches of frame pairs) or from ModelNet40 (meshes); for "
+    "the search, your own tables (.npy, .csv: A beside b, as `maxcon fit-pair --rows` writes).  [default: made data]",
+)
+@click.option(
+    "--threshold", type=float, metavar="E", help="Of the tables of --data: the largest residual of an inlier."
 )
 @click.option(
     "--from",
@@ -73,16 +87,20 @@ class _HeldOut(NamedTuple):
 )
 def command(
     family: str,
+    teacher: str | None,
     seed: int | None,
     updates: int | None,
     minutes: float | None,
     out: str | None,
     as_paper: bool,
     data: str | None,
+    threshold: float | None,
     start: str | None,
     changes: tuple[str, ...],
 ) -> None:
-    """Train an agent for lines or planes on random instances of the paper's protocol, or for fundamental matrices.
+    """Train an agent for lines, planes or fundamental matrices, or the networks of the learned search.
+
+    Lines and planes come from random instances of the paper's protocol.
 
     DIR gets config.json, log.jsonl, TensorBoard events, checkpoint.pt and, at the end, agent.safetensors, which
     `maxcon fit --method agent --option weights=FILE` and `maxcon evaluate --weights NAME=FILE` take. Ctrl-C
@@ -93,16 +111,28 @@ def command(
     0.01: frames 0 to 24 train, later ones are held out (--set frames=0,24 --set steps=1,3 --set sequence=NAME).
     No label is used anywhere.
 
+    FAMILY "search" trains the two small networks of the method "learned", for all families at once, by imitation of the
+    best sets that anything has found, or with --learner optima of those that are proven to be the largest.
+
     \b
     Examples:
       maxcon train line
       maxcon train plane --seed 1 --set n_points=200 --out runs/big
       maxcon train line --out runs/line-seed0        (goes on with what was stopped)
       maxcon train fundamental --from fundamental --data kitti
+      maxcon train search --updates 120
     """
     for module in ("torch", "tensorboard"):
         if find_spec(module) is None:
             raise Failure(f"training needs {module}, which is not installed: pip install 'maxcon[train]'")
+    chosen = check_learner(family, teacher)
+    if family == "search":
+        if as_paper or start is not None or changes:
+            raise Failure("--paper, --from and --set are for agents, not for the search")
+        train_search(chosen, seed or 0, updates or SEARCH_ROUNDS, minutes, out, data, threshold)
+        return
+    if threshold is not None:
+        raise Failure("--threshold is for the tables of the search; for agents it is --set threshold=E")
     place = _Place(*_data_folder(family, data), _weights(start, as_paper))
     config, folder = _run(family, seed, updates, out, as_paper, place, changes)
     learner, held_out = _train(config, folder, minutes, family, place)

@@ -49,7 +49,7 @@ LOOKS: dict[str, tuple[str, str, Line]] = {
     AUTO_LONG: (VERMILLION, "D", ":"),
     LEARNED: ("#8B3A00", "P", "-"),
     UCLM: ("#6A3D9A", "X", "-"),
-    UCLM_SWAP: ("#6A3D9A", "X", ":"),
+    UCLM_SWAP: ("#A78BD4", "X", ":"),
     RB: ("#A6A6A6", ".", "-"),
     RB_TREE: ("#A6A6A6", ".", ":"),
     RANSAC: (ORANGE, "<", "-"),

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 
 from maxcon.datasets.synthetic import THRESHOLD, synthetic_hyperplane
 from maxcon.datasets.two_view_scene import synthetic_two_view
-from maxcon.problem import LinearProblem
+from maxcon.problem import LinearProblem, check_threshold
 from maxcon.vision.fundamental import fundamental_problem
 
 #: Lines, planes, hyperplanes with 4 to 9 parameters, and fundamental matrices in two charts.
@@ -87,3 +88,41 @@ def draw_problem(families: Sequence[str], rng: np.random.Generator, ranges: Rang
     if family.startswith("fundamental"):
         threshold *= float(np.exp(rng.uniform(np.log(0.3), 0.0)))
     return problem, threshold
+
+
+def table_source(folder: Path, threshold: float) -> Callable[[np.random.Generator], tuple[LinearProblem, float]]:
+    """Return what draws problems from one's own tables: random rows of a random table.
+
+    Parameters
+    ----------
+    folder
+        Holds ``.npy`` or ``.csv`` files: A beside b, a point a row, no header.
+    threshold
+        The largest residual of an inlier in all of them.
+
+    Raises
+    ------
+    ValueError
+        If there is no such file, or one is no table of finite numbers with at least d + 2 rows.
+    """
+    threshold = check_threshold(threshold)
+    tables = []
+    for file in sorted([*folder.glob("*.npy"), *folder.glob("*.csv")]):
+        try:
+            table = np.load(file) if file.suffix == ".npy" else np.loadtxt(file, delimiter=",", ndmin=2)
+        except (ValueError, OSError) as error:
+            raise ValueError(f"{file.name} must be a table of numbers: {error}") from None
+        if table.ndim != 2 or table.shape[1] < 2 or len(table) <= table.shape[1] or not np.isfinite(table).all():
+            raise ValueError(f"{file.name} must hold more rows than columns of finite numbers, but it is {table.shape}")
+        tables.append(table.astype(np.float64))
+    if not tables:
+        raise ValueError(f"data must be a folder with .npy or .csv tables, but {str(folder)!r} has none")
+
+    def draw(rng: np.random.Generator) -> tuple[LinearProblem, float]:
+        table = tables[int(rng.integers(len(tables)))]
+        most = min(len(table), Ranges().many[1])
+        n_points = int(rng.integers(min(max(50, table.shape[1] + 1), most), most + 1))
+        rows = rng.choice(len(table), n_points, replace=False)
+        return LinearProblem(table[rows, :-1], table[rows, -1]), threshold
+
+    return draw

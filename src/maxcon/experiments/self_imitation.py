@@ -30,6 +30,7 @@ from maxcon.agent.point_features import N_POINT_FEATURES
 from maxcon.agent.search_networks import PEEL_WIDTHS, POINT_WIDTHS, SearchNetworks, save_search_networks
 from maxcon.experiments.search_instances import FAMILIES, Ranges, draw_problem, make_problem
 from maxcon.search.anytime import Task, make_task, run
+from maxcon.search.exact import exact
 from maxcon.search.gnc import gnc
 from maxcon.search.learned import learned
 from maxcon.search.learned_kernels import (
@@ -50,6 +51,14 @@ from maxcon.search.sampling import lo_ransac
 
 if TYPE_CHECKING:
     import torch
+
+    from maxcon.problem import LinearProblem
+
+#: What draws a problem with its threshold.
+Source = Callable[[np.random.Generator], "tuple[LinearProblem, float]"]
+
+#: How long a proof may take where labels are proven optima; the best set known stands in where it takes longer.
+PROOF_SECONDS = 0.2
 
 #: Removals of a walk that are recorded.
 LOG_STEPS = 60
@@ -82,6 +91,10 @@ class Recipe:
         Rounds of the search that competes for it, with the networks as they stand.
     point_widths, peel_widths
         Hidden widths of the networks.
+    labels
+        "best": the largest set known; "optima": the proven optimum where a proof takes no more than `PROOF_SECONDS`.
+    ranges
+        What problems are drawn from.
     """
 
     fits: int = 80
@@ -97,6 +110,7 @@ class Recipe:
     label_rounds: int = 25
     point_widths: tuple[int, ...] = POINT_WIDTHS[1:-1]
     peel_widths: tuple[int, ...] = PEEL_WIDTHS[1:-1]
+    labels: str = "best"
     ranges: Ranges = field(default_factory=Ranges)
 
 
@@ -147,6 +161,13 @@ def best_known(
         found.append(run(task, learned(task, network=nets, rounds=rounds), swap_refinement))
     best = max(found, key=lambda each: each.size)
     return best.subset if best.subset is not None else np.zeros(problem.n_points, dtype=np.bool_)
+
+
+def proven_optimum(problem: Any, threshold: float, seconds: float) -> NDArray[np.bool_] | None:
+    """Return the largest consensus set where that can be proven in so many seconds on one thread, else None."""
+    task = make_task(problem, threshold, np.random.default_rng(0), seconds)
+    best = run(task, exact(task, n_jobs=1), swap_refinement)
+    return best.subset if best.gap <= 0 else None
 
 
 def random_settings(rng: np.random.Generator, recipe: Recipe) -> Settings:
@@ -298,6 +319,7 @@ def train_search_networks(
     resume: bool = True,
     recipe: Recipe | None = None,
     judge_every: int = 10,
+    source: Source | None = None,
     progress: Callable[[TrainingProgress], object] | None = None,
 ) -> SearchNetworks:
     """Train a pair of networks for the learned search by self-imitation.
@@ -319,6 +341,8 @@ def train_search_networks(
         All other settings; None for the defaults.
     judge_every
         After so many rounds, and after the last, the mean gap on held-out problems is measured; 0 for never.
+    source
+        Draws a problem and its threshold from a generator; None for made problems of the families.
     progress
         Called after each round; a true return value stops the training there, to be resumed.
 
@@ -345,6 +369,12 @@ def train_search_networks(
     described = json.dumps(
         {"seed": seed, "families": list(families), "rounds": rounds, "recipe": asdict(recipe)}, sort_keys=True
     )
+    if recipe.labels not in ("best", "optima"):
+        raise ValueError(f"labels of the recipe must be 'best' or 'optima', but it is {recipe.labels!r}")
+
+    def made(rng: np.random.Generator) -> tuple[LinearProblem, float]:
+        return draw_problem(families, rng, recipe.ranges)
+
     start_rng = np.random.default_rng([seed, 0])
     first = SearchNetworks(
         random_perceptron((N_POINT_FEATURES, *recipe.point_widths, 1), start_rng),
@@ -358,7 +388,7 @@ def train_search_networks(
     began = time.perf_counter() - seconds
     while done < rounds:
         rng = np.random.default_rng([seed, 1, done])
-        records, gained = _play_round(learner.networks(), families, recipe, rng)
+        records, gained = _play_round(learner.networks(), source or made, recipe, rng)
         kept.append(records)
         losses = learner.learn(list(kept), done / max(rounds - 1, 1), rng)
         done += 1
@@ -373,13 +403,15 @@ def train_search_networks(
 
 
 def _play_round(
-    nets: SearchNetworks, families: Sequence[str], recipe: Recipe, rng: np.random.Generator
+    nets: SearchNetworks, source: Source, recipe: Recipe, rng: np.random.Generator
 ) -> tuple[Records, float]:
     recorder = Recorder()
     gained = 0
     for _ in range(recipe.fits):
-        problem, threshold = draw_problem(families, rng, recipe.ranges)
+        problem, threshold = source(rng)
+        optimum = proven_optimum(problem, threshold, PROOF_SECONDS) if recipe.labels == "optima" else None
         label = best_known(problem, threshold, recipe.samples, rng, nets, recipe.label_rounds)
+        label = label if optimum is None else optimum
         task = make_task(problem, threshold, rng)
         rounds = int(rng.integers(recipe.play_rounds[0], recipe.play_rounds[1] + 1))
         known, found = recorder.fit(task, nets, label, random_settings(rng, recipe), rounds)

@@ -140,7 +140,7 @@ def _page(folder: Path, records: Mapping[str, list[Run]], written: Mapping[str, 
     for name, rows in records.items():
         title, claims = _PARTS[name]
         yield ""
-        yield f"## {title}"
+        yield _escaped(f"## {title}")
         yield ""
         yield from (f"![{path.stem}](figures/{path.name})\n" for path in written.get(name, []))
         yield ""

@@ -35,8 +35,8 @@ PAUSE = 0.002
 #: Until a round has been timed: what it takes, in times of the root.
 ROUND_ROOTS = 1.6
 
-#: How many rounds the last swap takes at least; and how much of a round must fit into the time left for it to be played: a round
-#: that is begun is finished, so that the time limit is passed by at most the rest of it.
+#: How much of a round's time must be left for the last swap to be made, and for another round: what is begun is
+#: finished, so that the time limit is passed by at most the rest of it.
 SWAP_ROUNDS, ROUND_FITS = 0.5, 0.6
 
 

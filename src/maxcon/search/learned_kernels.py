@@ -185,8 +185,11 @@ def begin(search: Search, limit: float) -> None:
 
 
 @kernel
-def walk_from(search: Search, limit: float, settings: Settings, x: NDArray[np.float64]) -> None:
-    """Walk down from model x, add back, and keep what was found if it is more than the incumbent."""
+def walk_from(search: Search, limit: float, settings: Settings, x: NDArray[np.float64], loyal: bool) -> None:
+    """Walk down from model x, add back, and keep what was found if it is more than the incumbent.
+
+    A `loyal` walk removes no point of the incumbent: from its model it ends at a set that holds it.
+    """
     ws, walk, counts, r = search.ws, search.walk, search.counts, search.trial
     N = r.shape[0]
     compute_residuals(ws.At, ws.b, x, r)
@@ -203,6 +206,7 @@ def walk_from(search: Search, limit: float, settings: Settings, x: NDArray[np.fl
         r,
         inside / N,
         settings.explore,
+        search.member if loyal else search.member[:0],
         search.belief,
         search.scratch.state,
         walk,
@@ -245,10 +249,10 @@ def walk_part(search: Search, limit: float, settings: Settings, which: int) -> N
                     best = k
                     break
         if best >= 0:
-            walk_from(search, limit, settings, proposals.models[best])
+            walk_from(search, limit, settings, proposals.models[best], False)
     elif not search.counts[WALKED]:
         search.counts[WALKED] = 1
-        walk_from(search, limit, settings, search.x)
+        walk_from(search, limit, settings, search.x, settings.explore == 0.0)
 
 
 @kernel

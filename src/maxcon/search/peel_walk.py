@@ -115,6 +115,7 @@ def walk_down(
     proposal: NDArray[np.float64],
     proposal_share: float,
     explore: float,
+    kept: NDArray[np.bool_],
     belief: Belief,
     state: NDArray[np.int64],
     walk: Walk,
@@ -129,6 +130,9 @@ def walk_down(
         Shape (N,): the residuals of the model that the set comes from, and the share of its inliers.
     explore
         How often a basis point is removed at random (for training).
+    kept
+        Shape (N,): points that are not removed, or shape (0,) for none. Those of a feasible set: every basis of an
+        infeasible one holds another point.
     state
         The random state, used only to explore.
 
@@ -169,7 +173,7 @@ def walk_down(
         )
         if removed < walk.log.shape[0]:
             _keep_log(features, named, size, walk.log[removed], walk.log_basis[removed])
-        slot = _best_row(net, features, size, hidden)
+        slot = _best_row(net, features, named, size, kept, hidden)
         if explore > 0.0 and random_unit(state) < explore:
             slot = random_below(state, size)
         if refit_after_removal(wAt, wb, gain, cap, C, x, q, r, work, table, basis[slot]) != OK:
@@ -179,11 +183,20 @@ def walk_down(
 
 
 @kernel
-def _best_row(net: Perceptron, features: NDArray[np.float64], size: int, hidden: NDArray[np.float64]) -> int:
-    """Return which of the first `size` rows has the largest logit."""
+def _best_row(
+    net: Perceptron,
+    features: NDArray[np.float64],
+    named: NDArray[np.int64],
+    size: int,
+    kept: NDArray[np.bool_],
+    hidden: NDArray[np.float64],
+) -> int:
+    """Return which of the first `size` rows, but for points that are kept, has the largest logit."""
     best = 0
     most = -np.inf
     for slot in range(size):
+        if kept.shape[0] > 0 and kept[named[slot]]:
+            continue
         value = evaluate_row(net, features[slot], hidden)
         if value > most:
             most = value
