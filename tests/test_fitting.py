@@ -23,7 +23,7 @@ def problem():
 
 
 def serves(method, problem):
-    largest = {"sweep": 2, "agent": 3}
+    largest = {"sweep": 2, "agent": 3, "uclm": 3}
     return problem.n_params <= largest.get(method, 99)
 
 
@@ -56,12 +56,13 @@ def test_every_method_keeps_what_a_consensus_promises(method, n_params):
         with pytest.raises(ValueError, match=r"parameters, but this one has|families"):
             maxcon.fit(problem, 0.1, method=method)
         return
+    limit = 0.2 if method == "learned" else 2  # which takes all the time there is
     for refine in (None, "tree", "swap"):
-        result = maxcon.fit(problem, 0.1, method=method, refine=refine, time_limit=2)
+        result = maxcon.fit(problem, 0.1, method=method, refine=refine, time_limit=limit)
         check(result, problem, 0.1)
         assert result.method == method
-        again = maxcon.fit(problem, 0.1, method=method, refine=refine, time_limit=2)
-        if max(result.seconds, again.seconds) < 1.5:  # not cut short by the time limit
+        again = maxcon.fit(problem, 0.1, method=method, refine=refine, time_limit=limit)
+        if max(result.seconds, again.seconds) < 0.75 * limit:  # not cut short by the time limit
             assert np.array_equal(again.inlier_mask, result.inlier_mask)
 
 

@@ -105,7 +105,7 @@ def test_ctrl_c_shows_what_is_known(run, points, monkeypatch):
         time.sleep(20)
         yield
 
-    monkeypatch.setattr("maxcon.search.threshold_curve.exact_stabbing", slow)
+    monkeypatch.setattr("maxcon.search.threshold_curve.prove", slow)
     result = run("curve", points, "--model", "line")
     assert result.exit_code == 130
     assert "stopped by Ctrl-C" in result.stdout
