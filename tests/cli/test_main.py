@@ -5,7 +5,20 @@ import pytest
 
 import maxcon
 
-COMMANDS = ("fit", "fit-pair", "curve", "alternatives", "demo", "methods", "agents", "train", "evaluate", "verify")
+COMMANDS = (
+    "fit",
+    "fit-pair",
+    "curve",
+    "alternatives",
+    "demo",
+    "methods",
+    "agents",
+    "train",
+    "evaluate",
+    "reproduce",
+    "bench",
+    "verify",
+)
 
 
 def python(code):

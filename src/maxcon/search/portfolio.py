@@ -4,15 +4,16 @@
 | --- | --- | --- |
 | up to 3 | none, or enough for a proof (`PROOF_SECONDS`) | the exact search |
 | up to 3 | less | the learned search for `SHORT_SHARE` of the time, then the exact search |
-| more | none | the learned search until it has settled, then `BRIEF_WORK` of the exact search |
+| more | none | `propose`, the learned search until it has settled, then `BRIEF_WORK` of the exact search |
 | more | up to `ALL_LEARNED` seconds | the learned search |
-| more | more | the learned search until it has settled, at most `LONG_SHARE` of the time; then the exact search |
+| more | more | the same, for at most `LONG_SHARE` of the time; then the exact search |
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import replace
+from itertools import chain
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,6 +22,7 @@ from maxcon.search.anytime import Step, Task
 from maxcon.search.learned import learned
 from maxcon.search.partition import check_jobs, exact_partition
 from maxcon.search.proof import MOST_PARAMETERS, prove
+from maxcon.search.proposal import propose
 from maxcon.search.refine import swap_refinement
 
 #: Seconds a point that the exact search takes at 90% outliers, by the number of parameters.
@@ -33,12 +35,15 @@ SHORT_SHARE = 0.5
 #: less than what the learned search still gains.
 ALL_LEARNED = 0.02
 
+#: Of more points, `propose` takes longer than it is worth.
+PROPOSED_POINTS = 2000
+
 #: The learned search gets no more of the time than this where a proof is to follow.
 LONG_SHARE = 0.5
 
 #: Where no time is given, the exact search beyond three parameters ends after so much work, in columns of linear
-#: programmes: some 30 ms, which prove 20 to 30 outliers of 100 with eight parameters.
-BRIEF_WORK = 1_000_000
+#: programmes: some 60 ms, which prove 30 outliers of 100 with eight parameters, and most pairs of a KITTI drive.
+BRIEF_WORK = 2_000_000
 
 
 def auto(task: Task, *, n_jobs: int = -1) -> Iterator[Step]:
@@ -75,7 +80,9 @@ def _short(task: Task, left: float) -> Iterator[Step]:
 def _long(task: Task, left: float, n_jobs: int) -> Iterator[Step]:
     own = replace(task, deadline=task.deadline - (1.0 - LONG_SHARE) * left) if np.isfinite(left) else task
     best = np.zeros(task.problem.n_points, dtype=np.bool_)
-    for step in learned(replace(task, deadline=np.inf)):  # which then ends by itself
+    untimed = replace(task, deadline=np.inf)  # so that the learned search ends by itself
+    first = propose(task) if task.problem.n_points <= PROPOSED_POINTS else iter(())
+    for step in chain(first, learned(untimed)):
         if step.subset is not None and np.count_nonzero(step.subset) > np.count_nonzero(best):
             best = step.subset
         yield step
