@@ -6,7 +6,7 @@
 | up to 3 | less | the learned search for `SHORT_SHARE` of the time, then the exact search |
 | more | none | `propose`, the learned search until it has settled, then `BRIEF_WORK` of the exact search |
 | more | up to `ALL_LEARNED` seconds | the learned search |
-| more | more | the same, for at most `LONG_SHARE` of the time; then the exact search |
+| more | more | `propose` and the learned search, at most `LONG_SHARE` of the time; then the exact search |
 """
 
 from __future__ import annotations
