@@ -66,7 +66,7 @@ def test_agents_json(run, cards):
 
 
 def test_unknown_agent(fails):
-    names = "fundamental, fundamental-paper, line, plane"
+    names = "fundamental, fundamental-paper, line, line-paper, plane, plane-paper"
     assert f"name must be one of {names}, but it is 'circle'" in fails("agents", "circle")
 
 
