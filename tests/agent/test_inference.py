@@ -89,7 +89,7 @@ def problem_for(name, rng):
     if name.startswith("fundamental"):
         scene = synthetic_two_view(100, 0.3, rng)
         return fundamental_problem(scene.x1, scene.x2, threshold=0.1).problem
-    return synthetic_hyperplane(rng, 100, 0.5, {"line": 2, "plane": 3}[name])
+    return synthetic_hyperplane(rng, 100, 0.5, {"line": 2, "plane": 3}[name.partition("-")[0]])
 
 
 def test_shipped_agents_equal_torch_to_1e_5():
