@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from maxcon.certification import Certificate, issue, save
 from maxcon.minimax import minimax_fit
+from maxcon.minimax.jit import compile_seconds
 from maxcon.problem import Consensus, LinearProblem, check_indices, check_model, check_threshold, inlier_slack
 from maxcon.problem.validate import check_callback, check_gap, check_time_limit
 from maxcon.search.anytime import Progress, Task, make_task, run
@@ -40,8 +41,8 @@ def certify(
         The largest residual of an inlier, in the unit of b.
     model_or_mask
         The result: a model, shape (d,), whose inliers are counted as they are; or a `Consensus`, for its model; or
-        inliers, of shape (N,) or (N, 1), bool or 0 and 1, of which as many count as one model explains (their minimax
-        fit, if that is within the threshold).
+        inliers, of shape (N,) or (N, 1), bool or 0 and 1: their minimax fit is the model, and of them as many count as
+        it explains. Where no model explains them all, the largest part found that one explains counts.
     time_limit
         Seconds after which the bound proven so far is returned; None for no limit, which can take long where there are
         many outliers and more than three parameters.
@@ -62,7 +63,7 @@ def certify(
     TypeError, ValueError
         If an argument has the wrong type, shape or range; the message names it.
     """
-    began = time.perf_counter()
+    began, compiled = time.perf_counter(), compile_seconds()
     if not isinstance(problem, LinearProblem):
         raise TypeError(f"problem must be a LinearProblem, but it is a {type(problem).__name__}")
     threshold = check_threshold(threshold)
@@ -70,8 +71,8 @@ def certify(
     gap = check_gap(gap)
     check_callback(callback)
     task = make_task(problem, threshold, np.random.default_rng(0), time_limit)
-    model = _model(task, model_or_mask)
-    known = problem.residuals(model) <= _limit(problem, threshold)
+    model, counted = _given(task, model_or_mask)
+    known = (problem.residuals(model) <= _limit(problem, threshold)) & counted
     n_given = int(np.count_nonzero(known))
 
     def stop(progress: Progress) -> bool:
@@ -79,7 +80,8 @@ def certify(
         return asked or progress.upper_bound - n_given <= gap
 
     best = run(task, prove(task, known), None, stop)
-    return judge(task, model, best.upper_bound, time.perf_counter() - began)
+    seconds = time.perf_counter() - began - (compile_seconds() - compiled)
+    return judge(task, model, known, best.upper_bound, seconds)
 
 
 def write_certificate(path: str | Path, consensus: Consensus, *, time_limit: float | None = 10.0) -> Certificate:
@@ -122,8 +124,8 @@ def _limit(problem: LinearProblem, threshold: float) -> float:
     return threshold + inlier_slack(threshold, problem.scale)
 
 
-def _model(task: Task, model_or_mask: ArrayLike | Consensus) -> NDArray[np.float64]:
-    """Return the model given, or the minimax fit of the set given, or of the largest part of it found that has one."""
+def _given(task: Task, model_or_mask: ArrayLike | Consensus) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+    """Return the model given and that all points count, or the fit of the set given, or of a part, and the set."""
     problem = task.problem
     given = np.asarray(model_or_mask.model if isinstance(model_or_mask, Consensus) else model_or_mask)
     N = problem.n_points
@@ -137,15 +139,15 @@ def _model(task: Task, model_or_mask: ArrayLike | Consensus) -> NDArray[np.float
                 f"model_or_mask must be a model of shape ({problem.n_params},) or a mask of shape ({N},), but its "
                 f"shape is {given.shape}; of indices, make a mask: numpy.zeros({N}, bool), True at the indices"
             )
-        return check_model(given, problem.n_params, "model_or_mask")
+        return check_model(given, problem.n_params, "model_or_mask"), np.ones(N, dtype=np.bool_)
     mask = check_indices(given.reshape(-1) if given.shape == (N, 1) else given, N, "model_or_mask")
     fit = minimax_fit(problem, mask)
     limit = _limit(problem, task.threshold)
     if fit.value <= limit:
-        return fit.model
+        return fit.model, mask
     # The points outside the set are made such that no model explains them.
     part = LinearProblem(problem.A * mask[:, None], np.where(mask, problem.b, 2.0 * limit))
     seconds = task.seconds_left() / 2 if task.deadline < np.inf else None
     inner = make_task(part, task.threshold, np.random.default_rng(0), seconds)
     best = run(inner, propose(inner), swap_refinement)
-    return fit.model if best.subset is None else minimax_fit(problem, best.subset).model
+    return fit.model if best.subset is None else minimax_fit(problem, best.subset).model, mask

@@ -42,9 +42,9 @@ def test_a_good_certificate(run, points):
 @pytest.mark.usefixtures("certificate")
 def test_a_claim_that_the_file_does_not_prove(run, points):
     result = run("verify", "bare.json", points)
-    assert result.exit_code == 0, result.output
+    assert result.exit_code == 3, result.output
     assert "no model has more than 40 inliers" in result.stdout
-    assert "not proven by the file (--rerun proves it again)" in result.stdout
+    assert "not proven by the file (--rerun tries to prove it by another solver)" in result.stdout
     assert "proven by another solver" in run("verify", "bare.json", points, "--rerun").stdout
     assert (
         "nor by the rerun: the time limit" in run("verify", "bare.json", points, "--rerun", "--time-limit", 1e-9).stdout

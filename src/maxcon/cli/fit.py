@@ -149,7 +149,7 @@ def command(
     if json_out is not None:
         write_output(json_out, _json(consensus, table.source, model, names))
     if "-" not in (json_out, plot_out):
-        notes = ["compiling included"] * bool(compilations.buffer) + ["stopped by Ctrl-C"] * interrupted.is_set()
+        notes = ["compiling not counted"] * bool(compilations.buffer) + ["stopped by Ctrl-C"] * interrupted.is_set()
         _show(consensus, names, f"{model} through {table.source}, threshold {threshold:g}", refiner, notes)
         for out in (json_out, plot_out):
             if out is not None:

@@ -176,7 +176,7 @@ def command(
     if json_out is not None:
         write_output(json_out, _json(pair, found))
     if "-" not in (json_out, picture_out):
-        notes = ["compiling included"] * bool(compilations.buffer) + ["stopped by Ctrl-C"] * interrupted.is_set()
+        notes = ["compiling not counted"] * bool(compilations.buffer) + ["stopped by Ctrl-C"] * interrupted.is_set()
         out = console()
         out.print(Text(f"fundamental matrix of {' and '.join(pair.names)}, threshold {threshold:g}", style="bold"))
         out.print(pair_table(pair, found, refiner, notes))

@@ -18,7 +18,6 @@ def command() -> None:
     table.add_column("method", style="bold")
     table.add_column("what it does")
     table.add_column("options (--option KEY=VALUE)")
-    table.add_row("auto", "the proven optimum where that is cheap, else the method that finds most", "")
     for name, entry in METHODS.items():
         described = inspect.signature(entry.load()).parameters
         options = ", ".join(f"{each.name}={each.default}" for each in list(described.values())[1:])

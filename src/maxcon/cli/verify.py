@@ -15,7 +15,7 @@ from maxcon.cli.present import borderless, console, duration, plain
 from maxcon.cli.tables import N_COLUMNS, choose_columns, pose, read_table
 from maxcon.problem import LinearProblem
 
-#: The exit codes where a certificate is refused, and where it is accepted but --rerun could not prove its claim.
+#: The exit codes where a certificate is refused, and where it is accepted but its claim is not proven.
 REFUSED, UNPROVEN = 1, 3
 
 
@@ -69,7 +69,8 @@ def command(
 
     DATA is a table as `maxcon fit` reads it; "-" reads standard input. Points are counted from 0. The exit
     code is 0 if the certificate is accepted, 1 if it is refused, 2 if something could not be read, and 3 if it is
-    accepted but neither the file nor --rerun proves its claim.
+    accepted but its claim is proven neither by the file nor by --rerun. (The seal of a file guards against accidents; a
+    false claim is found out by what the file proves.)
 
     \b
     Examples:
@@ -93,7 +94,7 @@ def command(
         _show(report, None if isinstance(certificate, str) else certificate, f"{cert} about {data}")
     if not report.accepted:
         click.get_current_context().exit(REFUSED)
-    if rerun and not report.claim_confirmed:
+    if not report.claim_confirmed:
         click.get_current_context().exit(UNPROVEN)
 
 
@@ -139,7 +140,8 @@ def _show(report: VerificationReport, certificate: Certificate | None, heading: 
         table.add_row("because", Text(report.reason))
     if certificate is not None:
         about = f"threshold {certificate.threshold:g}; claimed by {certificate.package}, method {certificate.method}"
-        table.add_row("it is about", f"{certificate.family}, {about}, {duration(certificate.seconds)}")
+        text = f"{certificate.family}, {about}, {duration(certificate.seconds)}"
+        table.add_row("it is about", Text("".join(each if each.isprintable() else "?" for each in text)))
     table.add_row("time", duration(report.seconds))
     out.print(table)
 
@@ -157,5 +159,5 @@ def _claim(report: VerificationReport) -> Text:
         by.append(f"another solver ({rerun.solver}, {duration(rerun.seconds)})")
     if by:
         return Text(f"{claim}: proven by {' and by '.join(by)}", style="green")
-    why = "--rerun proves it again" if rerun is None else f"nor by the rerun: {rerun.note}"
+    why = "--rerun tries to prove it by another solver" if rerun is None else f"nor by the rerun: {rerun.note}"
     return Text(f"{claim}: not proven by the file ({why})", style="yellow")

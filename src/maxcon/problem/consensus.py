@@ -47,7 +47,7 @@ class Consensus:
     seed
         What seeded the random numbers (drawn or not), or None where a generator was passed.
     seconds
-        Wall-clock time of the fit.
+        Wall-clock time of the fit; kernels that were compiled on the way, once on a machine, are not counted.
     problem
         What was fitted.
     """

@@ -47,11 +47,12 @@ def conclude(task: Task, best: Best, method: str, seed: int | None, seconds: flo
     )
 
 
-def judge(task: Task, model: NDArray[np.float64], upper_bound: int, seconds: float) -> Consensus:
-    """Return the result that a given model is, whoever found it: its inliers as they are, under a proven bound."""
+def judge(
+    task: Task, model: NDArray[np.float64], mask: NDArray[np.bool_], upper_bound: int, seconds: float
+) -> Consensus:
+    """Return the result that a given model and set of its inliers are, whoever found them, under a proven bound."""
     problem = task.problem
     residuals = problem.residuals(model)
-    mask = residuals <= task.threshold + inlier_slack(task.threshold, problem.scale)
     n_inliers = int(mask.sum())
     upper_bound, status = _standing(task, n_inliers, upper_bound)
     return Consensus(

@@ -190,7 +190,7 @@ class PartitionSearch:
         residuals = self._residuals_of_fit(start)
         within = residuals <= limit
         self.inliers = within if np.count_nonzero(within) >= np.count_nonzero(start) else start.copy()
-        dealt = len(self.inliers) + 1
+        dealt = 2 * len(self.inliers) + 1  # so that the first deal is made, however many are out
         if self.inliers.any():
             yield Step(subset=self.inliers.copy())
         try:
