@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from maxcon.certification import Certificate, issue, save
 from maxcon.minimax import minimax_fit
 from maxcon.minimax.jit import compile_seconds
-from maxcon.problem import Consensus, LinearProblem, check_indices, check_model, check_threshold, inlier_slack
+from maxcon.problem import Consensus, LinearProblem, check_indices, check_model, check_threshold
 from maxcon.problem.validate import check_callback, check_gap, check_time_limit
 from maxcon.search.anytime import Progress, Task, make_task, run
 from maxcon.search.conclusion import judge
@@ -72,7 +72,7 @@ def certify(
     check_callback(callback)
     task = make_task(problem, threshold, np.random.default_rng(0), time_limit)
     model, counted = _given(task, model_or_mask)
-    known = (problem.residuals(model) <= _limit(problem, threshold)) & counted
+    known = (problem.residuals(model) <= problem.inlier_limit(threshold)) & counted
     n_given = int(np.count_nonzero(known))
 
     def stop(progress: Progress) -> bool:
@@ -120,10 +120,6 @@ def write_certificate(path: str | Path, consensus: Consensus, *, time_limit: flo
     return certificate
 
 
-def _limit(problem: LinearProblem, threshold: float) -> float:
-    return threshold + inlier_slack(threshold, problem.scale)
-
-
 def _given(task: Task, model_or_mask: ArrayLike | Consensus) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
     """Return the model given and that all points count, or the fit of the set given, or of a part, and the set."""
     problem = task.problem
@@ -142,7 +138,7 @@ def _given(task: Task, model_or_mask: ArrayLike | Consensus) -> tuple[NDArray[np
         return check_model(given, problem.n_params, "model_or_mask"), np.ones(N, dtype=np.bool_)
     mask = check_indices(given.reshape(-1) if given.shape == (N, 1) else given, N, "model_or_mask")
     fit = minimax_fit(problem, mask)
-    limit = _limit(problem, task.threshold)
+    limit = problem.inlier_limit(task.threshold)
     if fit.value <= limit:
         return fit.model, mask
     # The points outside the set are made such that no model explains them.

@@ -16,6 +16,7 @@ from maxcon.cli import INTERRUPTED
 from maxcon.cli.curve import result_json
 from maxcon.cli.errors import reported
 from maxcon.cli.interrupt import noticed
+from maxcon.cli.options import table_options
 from maxcon.cli.output import check_output, write_output
 from maxcon.cli.present import LISTED_OUTLIERS, borderless, console, duration, equation, number, runs_of
 from maxcon.cli.tables import choose_columns, pose, read_table
@@ -29,20 +30,13 @@ SHOWN = 10
 
 
 @click.command(name="alternatives", short_help="List all largest consensus sets.")
-@click.argument("file")
-@click.option("--model", required=True, type=click.Choice(["line", "plane", "hyperplane"]), help="What to fit.")
+@table_options
 @click.option(
     "--threshold",
     required=True,
     type=float,
     metavar="E",
     help="The largest residual of an inlier, in the unit of the dependent column.",
-)
-@click.option(
-    "--columns",
-    metavar="LIST",
-    help="Names or numbers (from 1) of the columns to use, separated by commas, the dependent one last. "
-    "Default: all columns.",
 )
 @click.option("--limit", type=click.IntRange(min=1), default=1000, show_default=True, help="List so many sets at most.")
 @click.option("--time-limit", type=float, metavar="SECONDS", help="Stop then with what is known so far.")

@@ -17,7 +17,8 @@ from rich.text import Text
 from maxcon.cli import INTERRUPTED
 from maxcon.cli.errors import Failure, reported
 from maxcon.cli.interrupt import noticed
-from maxcon.cli.output import PICTURES, check_output, write_output
+from maxcon.cli.options import table_options
+from maxcon.cli.output import PICTURES, check_matplotlib, check_output, write_output
 from maxcon.cli.present import borderless, console, duration, number, plain
 from maxcon.cli.tables import choose_columns, pose, read_table
 from maxcon.problem.tolerance import ABSOLUTE_SLACK
@@ -31,14 +32,7 @@ SHOWN = 20
 
 
 @click.command(name="curve", short_help="Show the largest consensus for every threshold.")
-@click.argument("file")
-@click.option("--model", required=True, type=click.Choice(["line", "plane", "hyperplane"]), help="What to fit.")
-@click.option(
-    "--columns",
-    metavar="LIST",
-    help="Names or numbers (from 1) of the columns to use, separated by commas, the dependent one last. "
-    "Default: all columns.",
-)
+@table_options
 @click.option("--from", "low", type=float, default=0.0, metavar="E", help="The smallest threshold.  [default: 0]")
 @click.option("--to", "high", type=float, metavar="E", help="The largest threshold.  [default: that of all points]")
 @click.option("--time-limit", type=float, metavar="SECONDS", help="Stop then with what is known so far.")
@@ -78,7 +72,7 @@ def command(
         check_output(json_out, "--json")
     if plot_out is not None:
         check_output(plot_out, "--plot", PICTURES)
-        _check_matplotlib()
+        check_matplotlib()
     table = read_table(file)
     used = choose_columns(table, columns, model)
     problem = pose(table, used, model)
@@ -162,13 +156,6 @@ def _table(curve: ConsensusCurve) -> Table:
         shown = threshold if threshold > 2.0 * ABSOLUTE_SLACK * curve.scale else 0.0  # zero but for rounding
         table.add_row(str(count), f"{count / curve.n_points:.0%}", number(shown), *bound, remark)
     return table
-
-
-def _check_matplotlib() -> None:
-    from maxcon.experiments.canvas import look  # noqa: PLC0415
-
-    with reported(), look():
-        pass
 
 
 def _picture(curve: ConsensusCurve, unit: str, title: str, out: str) -> bytes:

@@ -135,9 +135,8 @@ def _show(results: Sequence[_Result]) -> None:
 
 
 def _inliers(problem: LinearProblem, model: NDArray[np.float64], threshold: float) -> int:
-    from maxcon.problem import inlier_slack  # noqa: PLC0415
 
-    limit = threshold + inlier_slack(threshold, problem.scale)
+    limit = problem.inlier_limit(threshold)
     return int(np.count_nonzero(problem.residuals(model) <= limit))
 
 

@@ -15,7 +15,8 @@ from rich.text import Text
 from maxcon.cli import INTERRUPTED
 from maxcon.cli.errors import Failure, reported
 from maxcon.cli.interrupt import noticed
-from maxcon.cli.output import PICTURES, check_output, write_output
+from maxcon.cli.options import search_options, table_options
+from maxcon.cli.output import PICTURES, check_matplotlib, check_output, write_output
 from maxcon.cli.present import consensus_json, consensus_table, console, parameters
 from maxcon.cli.tables import choose_columns, pose, read_table
 
@@ -24,8 +25,7 @@ if TYPE_CHECKING:
 
 
 @click.command(name="fit", short_help="Fit a line, plane or hyperplane to a file of points.")
-@click.argument("file")
-@click.option("--model", required=True, type=click.Choice(["line", "plane", "hyperplane"]), help="What to fit.")
+@table_options
 @click.option(
     "--threshold",
     required=True,
@@ -33,51 +33,11 @@ if TYPE_CHECKING:
     metavar="E",
     help="The largest residual of an inlier, in the unit of the dependent column.",
 )
-@click.option(
-    "--columns",
-    metavar="LIST",
-    help="Names or numbers (from 1) of the columns to use, separated by commas, the dependent one last. "
-    "Default: all columns.",
-)
-@click.option(
-    "--method",
-    default="auto",
-    show_default=True,
-    metavar="NAME",
-    help="How to search; `maxcon methods` lists them.",
-)
-@click.option(
-    "--refine",
-    type=click.Choice(["tree", "swap", "none"]),
-    default="swap",
-    show_default=True,
-    help="How to improve what the search finds: local tree refinement, the same with swaps, or not at all.",
-)
-@click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True, help="Seeds the random numbers.")
-@click.option("--time-limit", type=float, metavar="SECONDS", help="Stop then with the best found so far.")
-@click.option(
-    "--gap",
-    type=click.IntRange(min=0),
-    default=0,
-    show_default=True,
-    help="Stop when the best found is proven to be within so many inliers of the largest possible.",
-)
-@click.option(
-    "--certify",
-    is_flag=True,
-    help="Prove how good the result is, after any method, until the optimum is proven or the time is over.",
-)
+@search_options
 @click.option(
     "--certificate",
     metavar="OUT",
     help="Write a certificate (JSON), which `maxcon verify` checks; implies --certify.",
-)
-@click.option(
-    "--option",
-    "options",
-    multiple=True,
-    metavar="KEY=VALUE",
-    help="An option of the method; may be repeated.",
 )
 @click.option("--json", "json_out", metavar="OUT", help="Write the result as JSON; - is standard output.")
 @click.option(
@@ -132,7 +92,7 @@ def command(
         check_output(json_out, "--json")
     if plot_out is not None:
         check_output(plot_out, "--plot", PICTURES)
-        _check_matplotlib()
+        check_matplotlib()
     table = read_table(file)
     used = choose_columns(table, columns, model)
     problem = pose(table, used, model)
@@ -238,13 +198,6 @@ def _json(consensus: Consensus, source: str, model: str, names: list[str]) -> by
         "parameters": parameters(consensus.model, model),
     }
     return consensus_json(consensus, about)
-
-
-def _check_matplotlib() -> None:
-    from maxcon.experiments.canvas import look  # noqa: PLC0415
-
-    with reported(), look():
-        pass
 
 
 def _picture(problem: LinearProblem, consensus: Consensus, names: list[str], title: str, out: str) -> bytes:

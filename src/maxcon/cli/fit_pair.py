@@ -18,7 +18,8 @@ from maxcon.cli import INTERRUPTED
 from maxcon.cli.errors import Failure, reported
 from maxcon.cli.fit import check_certificate, check_options, parse_options, write_proof
 from maxcon.cli.interrupt import noticed
-from maxcon.cli.output import PICTURES, check_output, write_output
+from maxcon.cli.options import search_options
+from maxcon.cli.output import PICTURES, check_matplotlib, check_output, write_output
 from maxcon.cli.present import REFINED_BY, borderless, consensus_json, console, duration, number, proof
 
 if TYPE_CHECKING:
@@ -60,39 +61,13 @@ class Pair:
     show_default=True,
     help="How the scale of F is fixed: near a robust estimate, or by an entry of it that is made 1.",
 )
-@click.option(
-    "--method", default="auto", show_default=True, metavar="NAME", help="How to search; `maxcon methods` lists them."
-)
-@click.option(
-    "--refine",
-    type=click.Choice(["tree", "swap", "none"]),
-    default="swap",
-    show_default=True,
-    help="How to improve what the search finds: local tree refinement, the same with swaps, or not at all.",
-)
-@click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True, help="Seeds the random numbers.")
-@click.option("--time-limit", type=float, metavar="SECONDS", help="Stop then with the best found so far.")
-@click.option(
-    "--gap",
-    type=click.IntRange(min=0),
-    default=0,
-    show_default=True,
-    help="Stop when the best found is proven to be within so many inliers of the largest possible.",
-)
-@click.option(
-    "--certify",
-    is_flag=True,
-    help="Prove how good the result is, after any method, until the optimum is proven or the time is over.",
-)
+@search_options
 @click.option(
     "--certificate",
     metavar="OUT",
     help="Write a certificate (JSON), which `maxcon verify` checks against --rows; implies --certify.",
 )
 @click.option("--rows", "rows_out", metavar="OUT", help="Write the linear problem as .npy: a match a row, A beside b.")
-@click.option(
-    "--option", "options", multiple=True, metavar="KEY=VALUE", help="An option of the method; may be repeated."
-)
 @click.option(
     "--ratio",
     type=float,
@@ -154,7 +129,7 @@ def command(
         check_output(json_out, "--json")
     if picture_out is not None:
         check_output(picture_out, "--picture", PICTURES)
-        _check_matplotlib()
+        check_matplotlib()
     pair = read_pair(files, ratio)
     refiner = None if refine == "none" else refine
     with noticed() as interrupted, install_recorder("numba:compile") as compilations:
@@ -265,13 +240,6 @@ def _json(pair: Pair, found: FundamentalFit) -> bytes:
         "sampson": found.sampson,
     }
     return consensus_json(found.consensus, about)
-
-
-def _check_matplotlib() -> None:
-    from maxcon.experiments.canvas import look  # noqa: PLC0415
-
-    with reported(), look():
-        pass
 
 
 def _picture(pair: Pair, found: FundamentalFit, out: str) -> bytes:

@@ -7,7 +7,7 @@ import sys
 import tempfile
 from pathlib import Path
 
-from maxcon.cli.errors import Failure
+from maxcon.cli.errors import Failure, reported
 
 #: Pictures that can be written, by suffix.
 PICTURES = (".png", ".svg", ".pdf")
@@ -49,6 +49,14 @@ def check_folder(out: str, option: str) -> Path:
         raise Failure(f"{option}: cannot make the folder {out!r}: {error.strerror}") from None
     _try_folder(folder, option)
     return folder
+
+
+def check_matplotlib() -> None:
+    """Make sure, before any work is done, that a picture can be drawn; Failure otherwise."""
+    from maxcon.experiments.canvas import look  # noqa: PLC0415
+
+    with reported(), look():
+        pass
 
 
 def write_output(out: str | Path, content: bytes) -> None:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from maxcon.datasets.synthetic import THRESHOLD, synthetic_hyperplane
 from maxcon.datasets.two_view_scene import synthetic_two_view
 from maxcon.experiments.search_instances import CHART_SAMPLES
-from maxcon.problem import LinearProblem, inlier_slack
+from maxcon.problem import LinearProblem
 from maxcon.vision.fundamental import FundamentalProblem, fundamental_problem
 
 #: The number of parameters of each family, in the order of the page.
@@ -74,7 +74,7 @@ class Instance:
     @property
     def limit(self) -> float:
         """The largest residual of an inlier: the threshold with the slack for rounding."""
-        return self.threshold + inlier_slack(self.threshold, self.problem.scale)
+        return self.problem.inlier_limit(self.threshold)
 
     def count(self, theta: NDArray[np.float64] | None) -> int:
         """Return how many points parameters `theta`, shape (d,), explain; 0 without a (finite) model."""

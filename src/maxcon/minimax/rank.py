@@ -8,6 +8,7 @@ from weakref import WeakKeyDictionary
 import numpy as np
 import scipy.linalg
 
+from maxcon.minimax.rational import reduced
 from maxcon.minimax.rows import linear_rows
 from maxcon.problem import LinearProblem
 
@@ -35,21 +36,9 @@ def _dependences_hold(problem: LinearProblem, rank: int) -> bool:
     chosen: list[int] = []
     if rank:
         chosen = scipy.linalg.qr(linear_rows(problem).At, mode="r", pivoting=True)[1][:rank].tolist()
-        scipy.linalg.qr(linear_rows(problem).At, mode="r", pivoting=True)[1][:rank].tolist() if rank else []
-    solved: list[tuple[int, list[Fraction]]] = []
-    for i in chosen:
-        row = [Fraction(value) for value in A[i].tolist()]
-        for lead, known in solved:
-            if row[lead]:
-                row = [x - row[lead] * y for x, y in zip(row, known, strict=True)]
-        lead = next((j for j in range(d) if row[j]), d)
-        if lead == d:
-            return False
-        row = [value / row[lead] for value in row]
-        for place, (other, known) in enumerate(solved):
-            if known[lead]:
-                solved[place] = (other, [x - known[lead] * y for x, y in zip(known, row, strict=True)])
-        solved.append((lead, row))
+    solved = reduced(A[chosen].tolist())
+    if len(solved) < rank:
+        return False
     leads = {lead for lead, _ in solved}
     columns = [[Fraction(value) for value in column] for column in np.unique(A, axis=0).T.tolist()]
     for free in range(d):

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from maxcon.problem.tolerance import inlier_slack
 from maxcon.problem.validate import check_array, check_model
 
 
@@ -75,6 +76,10 @@ class LinearProblem:
     def scale(self) -> float:
         """``max|b|``: the size of the numbers that a residual is a difference of."""
         return float(np.abs(self.b).max())
+
+    def inlier_limit(self, threshold: float) -> float:
+        """Return the largest residual that counts as an inlier: the threshold with the slack for rounding."""
+        return threshold + inlier_slack(threshold, self.scale)
 
     def same_data(self, other: LinearProblem) -> bool:
         """Whether another problem has the same A and b."""

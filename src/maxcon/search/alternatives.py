@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from maxcon.minimax import allocate, linear_rows, minimax_fit
 from maxcon.minimax.linear import OK, cold_fit
-from maxcon.problem import Consensus, LinearProblem, check_threshold, inlier_slack
+from maxcon.problem import Consensus, LinearProblem, check_threshold
 from maxcon.problem.validate import check_callback, check_time_limit
 from maxcon.search.alternative_kernels import (
     DONE,
@@ -260,7 +260,7 @@ class _Lister:
         """Return whether there is a largest set without the point, or with it; None where that stays open."""
         A, b = self.task.problem.A, self.task.problem.b
         N = len(b)
-        limit = self.task.threshold + inlier_slack(self.task.threshold, self.task.problem.scale)
+        limit = self.task.problem.inlier_limit(self.task.threshold)
         start = self.incumbent
         if out:  # no parameter moves its residual any more, which is too large
             A, b, start = A.copy(), b.copy(), start.copy()

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from maxcon.minimax import LinearRows, linear_rows
 from maxcon.minimax.jit import compile_seconds
-from maxcon.problem import LinearProblem, inlier_slack
+from maxcon.problem import LinearProblem
 
 
 @dataclass(frozen=True, eq=False)
@@ -135,7 +135,7 @@ def make_task(
     compiled = compile_seconds()
     deadline = np.inf if time_limit is None else time.perf_counter() + time_limit
     rows = linear_rows(problem)
-    limit = (threshold + inlier_slack(threshold, problem.scale)) / rows.scale
+    limit = problem.inlier_limit(threshold) / rows.scale
     return Task(problem, rows, threshold, limit, rng, deadline, gap, compiled)
 
 

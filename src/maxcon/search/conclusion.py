@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from maxcon.minimax import minimax_fit, rank_holds
-from maxcon.problem import Consensus, LinearProblem, Status, inlier_slack
+from maxcon.problem import Consensus, LinearProblem, Status
 from maxcon.search.anytime import Best, Task
 
 
@@ -17,7 +17,7 @@ def conclude(task: Task, best: Best, method: str, seed: int | None, seconds: flo
     with a model that is the fit of its own inliers.
     """
     problem = task.problem
-    limit = task.threshold + inlier_slack(task.threshold, problem.scale)
+    limit = problem.inlier_limit(task.threshold)
     subset = best.subset if best.subset is not None and best.subset.any() else any_feasible_set(task)
     if subset is None:
         return _infeasible(problem, task.threshold, method, seed, seconds)

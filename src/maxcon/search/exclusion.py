@@ -7,6 +7,8 @@ from fractions import Fraction
 import numpy as np
 from numpy.typing import NDArray
 
+from maxcon.minimax.rational import reduced
+
 
 def excludes(A: NDArray[np.float64], b: NDArray[np.float64], points: NDArray[np.int64], limit: float) -> bool:
     """Return whether no model has all residuals of these points within the limit, as one dependence of rows shows.
@@ -26,21 +28,7 @@ def excludes(A: NDArray[np.float64], b: NDArray[np.float64], points: NDArray[np.
     """
     n = len(points)
     # Columns of A are the equations for the weights y, with sum_k y[k] A[points[k]] = 0.
-    equations = [[Fraction(value) for value in column] for column in A[points].T.tolist()]
-    solved: list[tuple[int, list[Fraction]]] = []
-    for equation in equations:
-        row = equation
-        for lead, known in solved:
-            if row[lead]:
-                row = [x - row[lead] * y for x, y in zip(row, known, strict=True)]
-        lead = next((k for k, value in enumerate(row) if value), n)
-        if lead == n:
-            continue
-        row = [value / row[lead] for value in row]
-        for place, (other, known) in enumerate(solved):
-            if known[lead]:
-                solved[place] = (other, [x - known[lead] * y for x, y in zip(known, row, strict=True)])
-        solved.append((lead, row))
+    solved = reduced(A[points].T.tolist())
     if len(solved) != n - 1:
         return False
     free = next(k for k in range(n) if k not in {lead for lead, _ in solved})

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from maxcon.minimax import minimax_fit
-from maxcon.problem import Consensus, Explanation, LinearProblem, inlier_slack
+from maxcon.problem import Consensus, Explanation, LinearProblem
 from maxcon.problem.validate import check_time_limit
 from maxcon.search.anytime import make_task, run
 from maxcon.search.proof import prove
@@ -58,7 +58,7 @@ def explain(
     together = consensus.inlier_mask.copy()
     together[point] = True
     fit = minimax_fit(problem, together)
-    limit = consensus.threshold + inlier_slack(consensus.threshold, problem.scale)
+    limit = problem.inlier_limit(consensus.threshold)
     basis = fit.basis if fit.value > limit else np.empty(0, dtype=np.int64)
     if len(basis) == 1:  # no parameter moves its residual
         return Explanation(point, basis, 0, consensus.n_inliers, True)

@@ -279,8 +279,8 @@ class _Search:
         self.lower = np.zeros(N)
         self.unsettled = np.zeros(N, dtype=np.bool_)
         self.ends = low, high
-        self.least = low + inlier_slack(low, problem.scale) if low > 0 else -np.inf
-        self.most = high + inlier_slack(high, problem.scale)
+        self.least = problem.inlier_limit(low) if low > 0 else -np.inf
+        self.most = problem.inlier_limit(high)
         self.methods: list[Callable[[Task], Iterator[Step]]] = [prove]
         if problem.n_params == 2:
             self.methods.append(exact_sweep)
@@ -314,7 +314,7 @@ class _Search:
             best = run(task, method(task), swap_refinement)
             if best.subset is not None and best.size > 0:
                 self.try_model(minimax_fit(self.problem, best.subset).model)
-            limit = threshold + inlier_slack(threshold, self.problem.scale)
+            limit = self.problem.inlier_limit(threshold)
             bounded = self.lower[best.upper_bound :]
             np.maximum(bounded, np.minimum(limit, self.upper[best.upper_bound :]), out=bounded)
             if best.interrupted or task.over():

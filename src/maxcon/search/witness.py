@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 from maxcon.minimax import LinearRows, Workspace, allocate
 from maxcon.minimax.linear import OK, cold_fit, compute_residuals
-from maxcon.problem import check_indices, inlier_slack
+from maxcon.problem import check_indices
 from maxcon.search.anytime import Task
 from maxcon.search.exclusion import excludes
 from maxcon.search.witness_kernels import (
@@ -341,7 +341,7 @@ class _Maker:
         fitted = (workspace.gain > 0) | (state == KEPT)
         tight = workspace.q[workspace.q >= 0] >> 1
         rest = np.r_[tight, np.flatnonzero(state == KEPT), np.flatnonzero(fitted)[::-1]].tolist()
-        limit = self.task.threshold + inlier_slack(self.task.threshold, problem.scale)
+        limit = problem.inlier_limit(self.task.threshold)
         while not excludes(problem.A, problem.b, points[basis], limit):
             more = next((point for point in rest if point not in basis), None)
             if more is None or len(basis) == len(row):

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from maxcon.minimax import linear_rows
 from maxcon.minimax.jit import kernel
 from maxcon.minimax.linear import OK, basis_multipliers, basis_points, cold_fit, refit_after_removal
-from maxcon.problem import LinearProblem, inlier_slack
+from maxcon.problem import LinearProblem
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,10 +58,7 @@ def make_instances(problems: list[LinearProblem], threshold: float) -> Instances
     shapes = {each.At.shape for each in rows}
     if len(shapes) > 1:
         raise ValueError(f"problems must all have the same rank and number of points, but they have {sorted(shapes)}")
-    limit = [
-        (threshold + inlier_slack(threshold, problem.scale)) / each.scale
-        for problem, each in zip(problems, rows, strict=True)
-    ]
+    limit = [problem.inlier_limit(threshold) / each.scale for problem, each in zip(problems, rows, strict=True)]
     return Instances(np.stack([each.At for each in rows]), np.stack([each.b for each in rows]), np.array(limit))
 
 
