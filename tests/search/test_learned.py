@@ -4,6 +4,7 @@ import os
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 
@@ -27,7 +28,15 @@ from maxcon.search.anytime import Step, make_task, run
 from maxcon.search.belief_proposals import MANY
 from maxcon.search.exact import exact
 from maxcon.search.learned import learned
-from maxcon.search.learned_kernels import Settings, begin_search, finish_search, play_parts, play_rounds
+from maxcon.search.learned_kernels import (
+    PARTS,
+    Settings,
+    begin_search,
+    begin_search_above,
+    finish_search,
+    play_parts,
+    play_rounds,
+)
 from maxcon.search.learned_memory import FLAGS_USED, FLOATS_USED, INTEGERS_USED, N_COUNTS, SIZE, allocate_arena, carve
 from maxcon.search.random_kernels import seed_state
 from maxcon.search.refine import swap_refinement
@@ -121,7 +130,7 @@ def test_rounds_in_one_call_or_many_or_part_by_part_are_the_same():
             if way == 1:
                 play_rounds(arena, task.limit, Settings(), 1)
             elif way == 2:
-                for part in range(6):
+                for part in range(PARTS):
                     play_parts(arena, task.limit, Settings(), part, part + 1)
         finish_search(arena, task.limit)
         ends.append((arena.floats.copy(), arena.integers.copy(), arena.flags.copy()))
@@ -267,3 +276,35 @@ def test_the_same_without_compilation():
         [sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=300, env=environment
     )
     assert found.stdout.strip() == str(sizes_by_round())
+
+
+@compiled_only
+@pytest.mark.parametrize(("d", "n_points", "rate"), [(2, 900, 0.8), (8, 1000, 0.7), (8, 6000, 0.5)])
+def test_the_root_of_many_points_starts_where_a_search_on_a_few_ended(d, n_points, rate):
+    problem = synthetic_hyperplane(np.random.default_rng([n_points, 15]), n_points, rate, d)
+    task = make_task(problem, 0.1, np.random.default_rng(0))
+    best = run(task, learned(task, rounds=1), swap_refinement)
+    assert best.size >= round((1 - rate) * n_points)
+    assert_feasible(task, best.subset)
+    again = make_task(problem, 0.1, np.random.default_rng(0))
+    np.testing.assert_array_equal(run(again, learned(again, rounds=1), swap_refinement).subset, best.subset)
+
+
+@compiled_only
+@pytest.mark.parametrize("afresh", [False, True])
+def test_a_search_above_takes_the_incumbent_of_the_one_below(afresh):
+    problem = synthetic_hyperplane(np.random.default_rng(16), 800, 0.6, 5)
+    task = make_task(problem, 0.1, np.random.default_rng(0))
+    few = np.sort(task.rng.choice(800, 100, replace=False))
+    rows = replace(task.rows, At=np.ascontiguousarray(task.rows.At[:, few]), b=task.rows.b[few])
+    nets = shipped_search_networks()
+    coarse = allocate_arena(rows, seed_state(task.rng), nets.points, nets.peel)
+    begin_search(coarse, task.limit)
+    play_rounds(coarse, task.limit, Settings(), 2)
+    arena = arena_for(task)
+    begin_search_above(arena, task.limit, coarse, Settings(), afresh)
+    above, below = carve(arena), carve(coarse)
+    assert above.member.sum() >= 320
+    assert (above.l1 == below.l1).all() != afresh
+    assert_feasible(task, above.member)
+    np.testing.assert_array_equal(np.isfinite(above.belief.p), True)

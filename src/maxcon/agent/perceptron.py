@@ -107,11 +107,13 @@ def evaluate_columns(
         for layer in range(depth):
             fan_in, width = widths[layer], widths[layer + 1]
             bias = start + fan_in * width
-            source = inputs[:, first : first + m] if layer == 0 else hidden[1 - (layer & 1), :, :m]
+            base = first if layer == 0 else 0
+            source = inputs if layer == 0 else hidden[1 - (layer & 1)]
             target = hidden[layer & 1]
             for j in range(0, width, 2):
                 two = j + 1 < width
-                t0, t1 = target[j, :m], target[j + 1 if two else j, :m]
+                # Rows first, then their parts: so the compiler knows that they are contiguous.
+                t0, t1 = target[j][:m], target[j + 1 if two else j][:m]
                 for i in range(m):
                     t0[i] = weights[bias + j]
                 if two:
@@ -121,7 +123,7 @@ def evaluate_columns(
                 while k < fan_in:
                     a = start + k * width + j
                     if not (two and k + 3 < fan_in):
-                        h0, c0 = source[k], weights[a]
+                        h0, c0 = source[k][base : base + m], weights[a]
                         for i in range(m):
                             t0[i] += c0 * h0[i]
                         if two:
@@ -130,7 +132,8 @@ def evaluate_columns(
                                 t1[i] += e0 * h0[i]
                         k += 1
                         continue
-                    h0, h1, h2, h3 = source[k], source[k + 1], source[k + 2], source[k + 3]
+                    h0, h1 = source[k][base : base + m], source[k + 1][base : base + m]
+                    h2, h3 = source[k + 2][base : base + m], source[k + 3][base : base + m]
                     c0, c1, c2, c3 = weights[a], weights[a + width], weights[a + 2 * width], weights[a + 3 * width]
                     a += 1
                     e0, e1, e2, e3 = weights[a], weights[a + width], weights[a + 2 * width], weights[a + 3 * width]

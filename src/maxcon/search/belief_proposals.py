@@ -18,6 +18,10 @@ from maxcon.search.sampling_kernels import Scratch
 #: From so many points on, samples are ranked on `FEW` random ones first.
 MANY, FEW = 400, 256
 
+#: Where samples were ranked on some points, they are refined on those first, and on all points from this control
+#: parameter of the loss on.
+POLISH = 2.56
+
 #: How many samples are kept by rank, and of these, how many are refined.
 KEPT = 8
 
@@ -196,10 +200,28 @@ def refine_proposals(
         if scores[k] < 0.0:
             count = k
             break
+    m = proposals.few_b.shape[0]
+    brief = Scratch(
+        scratch.state,
+        scratch.pool,
+        scratch.inliers,
+        scratch.near,
+        scratch.x,
+        scratch.trial,
+        scratch.r[:m],
+        scratch.w[:m],
+        scratch.weighted[:m],
+        scratch.table,
+        scratch.places,
+    )
     for k in range(count):
         for j in range(d):
             x[j] = models[k, j]
-        found, _ = descend(At, b, limit, local * local, SHRINK, 1000, scratch, x, proposals.best, -1)
+        control = local * local
+        if m > 0:
+            descend(proposals.few_rows, proposals.few_b, limit, control, SHRINK, 1000, brief, x, proposals.best, -1)
+            control = min(control, POLISH)
+        found, _ = descend(At, b, limit, control, SHRINK, 1000, scratch, x, proposals.best, -1)
         if found > size:
             size = found
             for j in range(d):
@@ -211,12 +233,12 @@ def refine_proposals(
         cast_vote(belief.votes, belief.totals, belief.tops, SOFT, scores[k], scratch.r)
         cast_vote(belief.votes, belief.totals, belief.tops, SHARP, float(count_there), scratch.r)
     for k in range(1, count):  # by score, best first
-        m = k
-        while m > 0 and scores[m - 1] < scores[m]:
-            scores[m - 1], scores[m] = scores[m], scores[m - 1]
+        place = k
+        while place > 0 and scores[place - 1] < scores[place]:
+            scores[place - 1], scores[place] = scores[place], scores[place - 1]
             for j in range(d):
-                models[m - 1, j], models[m, j] = models[m, j], models[m - 1, j]
-            m -= 1
+                models[place - 1, j], models[place, j] = models[place, j], models[place - 1, j]
+            place -= 1
     for k in range(count, KEPT):
         scores[k] = -1.0
     return size

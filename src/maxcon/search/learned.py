@@ -9,15 +9,37 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from maxcon.agent.search_networks import SearchNetworks, load_search_networks, shipped_search_networks
+from maxcon.minimax import LinearRows
 from maxcon.search.anytime import Step, Task
-from maxcon.search.learned_kernels import Settings, begin_search, check_settings, finish_search, play_rounds
-from maxcon.search.learned_memory import AGREEMENT, DOUBTS, N_COUNTS, ROUND, SIZE, STALL, SWAPPED, allocate_arena
+from maxcon.search.belief_proposals import MANY
+from maxcon.search.learned_kernels import (
+    PARTS,
+    Settings,
+    begin_search,
+    begin_search_above,
+    check_settings,
+    finish_search,
+    play_parts,
+    play_rounds,
+)
+from maxcon.search.learned_memory import (
+    AGREEMENT,
+    DOUBTS,
+    N_COUNTS,
+    ROUND,
+    SIZE,
+    STALL,
+    SWAPPED,
+    Arena,
+    allocate_arena,
+)
 from maxcon.search.random_kernels import seed_state
 from maxcon.search.sampling import check_count
 
@@ -32,12 +54,21 @@ ROUNDS_OPEN = 24
 #: A set is yielded, or an empty step, about so often, in seconds; a set costs 10 us.
 PAUSE = 0.002
 
+#: The root of more than `MANY` points is that of a search on `COARSE` random ones, or a `COARSER`-th of the points if
+#: that is more: rounds there until its belief agrees with its incumbent, at most so many, in at most this share of the
+#: time, but one at least.
+COARSE, COARSER, COARSE_ROUNDS, COARSE_SHARE = 200, 6, 8, 0.3
+
+#: Where it does not agree in the end, the models of all points are made too, if there are so many times as much time as
+#: has been spent.
+AFRESH = 3.0
+
 #: Until a round has been timed: what it takes, in times of the root.
 ROUND_ROOTS = 1.6
 
-#: How much of a round's time must be left for the last swap to be made, and for another round: what is begun is
-#: finished, so that the time limit is passed by at most the rest of it.
-SWAP_ROUNDS, ROUND_FITS = 0.5, 0.6
+#: How much of a round's time must be left for the last swap to be made, and of what a piece of a round takes for
+#: another one: what is begun is finished, so that the time limit is passed by at most the rest of it.
+SWAP_ROUNDS, PIECE_FITS = 0.5, 0.6
 
 
 def learned(
@@ -98,24 +129,60 @@ def learned(
 
 def _search(task: Task, nets: SearchNetworks, rounds: int | None, settings: Settings) -> Iterator[Step]:
     began = time.perf_counter()
-    arena = allocate_arena(task.rows, seed_state(task.rng), nets.points, nets.peel)
+    arena = _root(task, nets, settings)
     counts, member, limit = arena.integers[:N_COUNTS], arena.flags[: task.problem.n_points], task.limit
-    begin_search(arena, limit)
     now = spoken = time.perf_counter()
-    round_seconds = ROUND_ROOTS * (now - began)
+    # Of many points, a round takes so long that the clock is looked at between its parts.
+    pieces = [(k, k + 1) for k in range(PARTS)] if task.problem.n_points > MANY else [(0, PARTS)]
+    took = [ROUND_ROOTS * (now - began) / len(pieces)] * len(pieces)
     reported = 0
-    while (rounds is None or counts[ROUND] < rounds) and task.deadline - now > ROUND_FITS * round_seconds:
-        play_rounds(arena, limit, settings, 1)
-        done = time.perf_counter()
-        round_seconds, now = max(0.8 * round_seconds, done - now), done
-        if task.deadline == np.inf and rounds is None and _is_settled(counts):
-            break
-        if now - spoken > PAUSE and task.deadline - now > 2.0 * round_seconds:
-            yield _news(counts, member, reported)
-            reported, spoken = int(counts[SIZE]), now
-    if not counts[SWAPPED] and task.deadline - now > SWAP_ROUNDS * round_seconds:
+    while rounds is None or counts[ROUND] < rounds:
+        for number, (first, last) in enumerate(pieces):
+            if task.deadline - now <= PIECE_FITS * took[number]:
+                break
+            play_parts(arena, limit, settings, first, last)
+            done = time.perf_counter()
+            took[number], now = max(0.8 * took[number], done - now), done
+        else:
+            if task.deadline == np.inf and rounds is None and _is_settled(counts):
+                break
+            if now - spoken > PAUSE and task.deadline - now > 2.0 * sum(took):
+                yield _news(counts, member, reported)
+                reported, spoken = int(counts[SIZE]), now
+            continue
+        break
+    if not counts[SWAPPED] and task.deadline - now > SWAP_ROUNDS * sum(took):
         finish_search(arena, limit)
     yield _news(counts, member, reported)
+
+
+def _root(task: Task, nets: SearchNetworks, settings: Settings) -> Arena:
+    """Return a search that has begun; where there are many points, above searches on fewer of them."""
+    N = task.problem.n_points
+    sizes = [N]
+    while sizes[-1] > MANY:
+        sizes.append(max(sizes[-1] // COARSER, COARSE))
+    began, brief, coarse = time.perf_counter(), settings._replace(variations=0), None
+    left = task.deadline - began
+    for size in reversed(sizes):
+        rows = task.rows if size == N else _some(task.rows, task.rng.choice(N, size, replace=False))
+        arena = allocate_arena(rows, seed_state(task.rng), nets.points, nets.peel)
+        counts = arena.integers[:N_COUNTS]
+        if coarse is None:
+            begin_search(arena, task.limit)
+        else:
+            afresh = not _agrees(coarse.integers) and AFRESH * (time.perf_counter() - began) < left
+            begin_search_above(arena, task.limit, coarse, settings, afresh)
+        while size < N and counts[ROUND] < COARSE_ROUNDS and not (counts[ROUND] > 0 and _agrees(counts)):
+            if counts[ROUND] > 0 and time.perf_counter() - began > COARSE_SHARE * left:
+                break
+            play_rounds(arena, task.limit, brief, 1)
+        coarse = arena
+    return arena
+
+
+def _some(rows: LinearRows, points: NDArray[np.int64]) -> LinearRows:
+    return replace(rows, At=np.ascontiguousarray(rows.At[:, points]), b=rows.b[points])
 
 
 def _news(counts: NDArray[np.int64], member: NDArray[np.bool_], reported: int) -> Step:
@@ -125,5 +192,9 @@ def _news(counts: NDArray[np.int64], member: NDArray[np.bool_], reported: int) -
 def _is_settled(counts: NDArray[np.int64]) -> bool:
     """Return whether further rounds are unlikely to gain; see `learned`."""
     stall = int(counts[STALL])
-    agrees = counts[AGREEMENT] >= 1000.0 * SURE and counts[DOUBTS] <= max(1.0, DOUBTFUL * counts[SIZE])
-    return stall >= (ROUNDS_AGREED if agrees else max(ROUNDS_OPEN, int(counts[ROUND]) - stall))
+    return stall >= (ROUNDS_AGREED if _agrees(counts) else max(ROUNDS_OPEN, int(counts[ROUND]) - stall))
+
+
+def _agrees(counts: NDArray[np.int64]) -> bool:
+    """Return whether the belief agrees with the incumbent."""
+    return bool(counts[AGREEMENT] >= 1000.0 * SURE and counts[DOUBTS] <= max(1.0, DOUBTFUL * counts[SIZE]))

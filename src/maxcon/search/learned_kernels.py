@@ -15,8 +15,9 @@ from maxcon.agent.point_features import write_best_features
 from maxcon.minimax.jit import kernel
 from maxcon.minimax.linear import OK, cold_fit, compute_residuals
 from maxcon.problem.validate import check_number
-from maxcon.search.belief import agreement, forget_votes, root_models, start_belief, update_belief
-from maxcon.search.belief_proposals import KEPT, propose, refine_proposals, same_model
+from maxcon.search.belief import SHRINK, agreement, forget_votes, root_models, start_belief, update_belief
+from maxcon.search.belief_proposals import KEPT, MANY, propose, refine_proposals, same_model
+from maxcon.search.gnc_kernels import descend
 from maxcon.search.learned_memory import (
     AGREEMENT,
     DOUBTS,
@@ -33,13 +34,14 @@ from maxcon.search.learned_memory import (
     Search,
     carve,
 )
-from maxcon.search.model_kernels import count_within
+from maxcon.search.model_kernels import count_within, least_squares_model
 from maxcon.search.peel_walk import choose_start, install_walk, walk_down
+from maxcon.search.random_kernels import draw_next, random_below
 from maxcon.search.refine_kernels import refine_kernel, swap_kernel
 from maxcon.search.vertex_kernels import load_vertex, save_vertex
 
-#: The parts of a round, in order; walks 0 and 1 start from proposals, 2 from the incumbent.
-PROPOSE, WALK, BELIEVE, SWAP, PARTS = 0, 1, 4, 5, 6
+#: The parts of a round, in order; walks 0 and 1 start from proposals, 2 from the incumbent, the rest from variations.
+PROPOSE, WALK, VARY, BELIEVE, SWAP, PARTS = 0, 1, 4, 5, 6, 7
 
 #: Two starts are the same where their residuals differ by less than this many limits, root mean square.
 SAME_START = 0.1
@@ -73,6 +75,12 @@ class Settings(NamedTuple):
         The mean belief in the incumbent's points from which on it is swapped, one round later.
     explore
         How often a walk removes a random basis point; for training.
+    variations, sure
+        How many walks start from variations of the incumbent, thrice as many with more than `MANY` points; and `sure`
+        times as many where the mean belief in the incumbent's points is above `agreed`.
+    least, most
+        A variation is the least-squares model of a random number of the incumbent's points: between these, in times
+        of r.
     """
 
     samples: int = 100
@@ -85,6 +93,10 @@ class Settings(NamedTuple):
     patience: int = 5
     agreed: float = 0.85
     explore: float = 0.0
+    variations: int = 6
+    least: int = 2
+    most: int = 8
+    sure: int = 4
 
 
 #: The least and the largest value of each setting.
@@ -99,6 +111,10 @@ _RANGES = {
     "patience": (1, 2**31 - 1),
     "agreed": (0.0, 2.0),
     "explore": (0.0, 1.0),
+    "variations": (0, 10**6),
+    "sure": (1, 1000),
+    "least": (1, 1000),
+    "most": (1, 1000),
 }
 
 
@@ -164,10 +180,9 @@ def _note_progress(search: Search, limit: float, r: NDArray[np.float64]) -> None
 
 
 @kernel
-def begin(search: Search, limit: float) -> None:
-    """Do the root: the two models of all points, the first incumbent, the first belief."""
-    ws, counts = search.ws, search.counts
-    for i in range(ws.b.shape[0]):
+def _clear(search: Search) -> None:
+    """Make a search one that has not begun."""
+    for i in range(search.ws.b.shape[0]):
         search.scratch.pool[i] = i
         search.belief.p[i] = 0.5
         for k in range(search.refinement.certificate.shape[1]):
@@ -175,12 +190,45 @@ def begin(search: Search, limit: float) -> None:
     for k in range(MEMORY):
         for j in range(search.x.shape[0]):
             search.starts[k, j] = np.inf
-    root_models(ws.At, ws.b, limit, search.scratch, search.l1, search.gnc)
-    start_belief(ws.At, ws.b, limit, search.scratch, search.l1, search.gnc, search.belief)
+
+
+@kernel
+def begin(search: Search, limit: float) -> None:
+    """Do the root: the two models of all points, the first incumbent, the first belief."""
+    _clear(search)
+    root_models(search.ws.At, search.ws.b, limit, search.scratch, search.l1, search.gnc)
     for j in range(search.x.shape[0]):
         search.x[j] = search.gnc[j]
+    _begin_belief(search, limit)
+
+
+@kernel
+def begin_above(search: Search, limit: float, coarse: Search, local: float, afresh: bool) -> None:
+    """Do the root with what a search on some of the points has found: its incumbent moved to a local minimum.
+
+    The two models of all points are those of the coarse search, unless they are to be made `afresh`.
+    """
+    _clear(search)
+    ws, scratch = search.ws, search.scratch
+    size = -1
+    if afresh:
+        size = root_models(ws.At, ws.b, limit, scratch, search.l1, search.gnc)
+    for j in range(search.x.shape[0]):
+        if not afresh:
+            search.l1[j] = coarse.l1[j]
+            search.gnc[j] = coarse.gnc[j]
+        search.x[j] = search.gnc[j]
+        scratch.x[j] = coarse.x[j]
+    descend(ws.At, ws.b, limit, local * local, SHRINK, 1000, scratch, scratch.x, search.x, size)
+    _begin_belief(search, limit)
+
+
+@kernel
+def _begin_belief(search: Search, limit: float) -> None:
+    ws, scratch = search.ws, search.scratch
+    start_belief(ws.At, ws.b, limit, scratch, search.l1, search.gnc, search.belief)
     take_model(search, limit)
-    counts[STALL] = 0
+    search.counts[STALL] = 0
     update_belief(search.point_net, 0, search.belief)
 
 
@@ -256,6 +304,30 @@ def walk_part(search: Search, limit: float, settings: Settings, which: int) -> N
 
 
 @kernel
+def vary_part(search: Search, limit: float, settings: Settings) -> None:
+    """Walk from least-squares models of a few of the incumbent's points each."""
+    ws, scratch, member = search.ws, search.scratch, search.member
+    d = search.x.shape[0]
+    count = settings.variations * (3 if member.shape[0] > MANY else 1)
+    if search.counts[AGREEMENT] > 1000.0 * settings.agreed:
+        count *= settings.sure
+    for _ in range(count):
+        size = 0
+        for i in range(member.shape[0]):
+            if member[i]:
+                scratch.inliers[size] = i
+                size += 1
+        few = d * (settings.least + random_below(scratch.state, max(settings.most - settings.least, 0) + 1))
+        few = min(few, size // 2)
+        if few <= d:
+            return
+        for k in range(few):
+            draw_next(scratch.state, scratch.inliers, k, size)
+        least_squares_model(ws.At, ws.b, scratch.inliers, few, scratch.table, scratch.x)
+        walk_from(search, limit, settings, scratch.x, False)
+
+
+@kernel
 def propose_part(search: Search, limit: float, settings: Settings) -> None:
     """Draw and refine proposals; a model that explains more than the incumbent replaces it."""
     ws, belief, scratch = search.ws, search.belief, search.scratch
@@ -311,8 +383,10 @@ def play(search: Search, limit: float, settings: Settings, first: int, last: int
     for part in range(first, last):
         if part == PROPOSE:
             propose_part(search, limit, settings)
-        elif part < BELIEVE:
+        elif part < VARY:
             walk_part(search, limit, settings, part - WALK)
+        elif part == VARY:
+            vary_part(search, limit, settings)
         elif part == BELIEVE:
             counts[ROUND] += 1
             update_belief(search.point_net, counts[ROUND], search.belief)
@@ -331,6 +405,14 @@ def play(search: Search, limit: float, settings: Settings, first: int, last: int
 def begin_search(arena: Arena, limit: float) -> None:
     """Do the root."""
     begin(carve(arena), limit)
+
+
+@kernel
+def begin_search_above(arena: Arena, limit: float, coarse: Arena, settings: Settings, afresh: bool) -> None:
+    """Do the root from what a search on some of the points has found, and walk from there; see `begin_above`."""
+    search = carve(arena)
+    begin_above(search, limit, carve(coarse), settings.local, afresh)
+    play(search, limit, settings, VARY - 1, VARY)
 
 
 @kernel

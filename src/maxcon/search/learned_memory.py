@@ -21,6 +21,7 @@ from maxcon.search.belief_proposals import FEW, KEPT, MANY, Proposals
 from maxcon.search.peel_walk import Walk
 from maxcon.search.refine_kernels import RefineScratch
 from maxcon.search.sampling_kernels import Scratch
+from maxcon.search.trial_kernels import NearRows
 from maxcon.search.vertex_kernels import VertexCopies
 
 #: How many starts of walks are remembered, so that none is made twice.
@@ -115,15 +116,15 @@ def allocate_arena(
     n, wide = d + 1, max(N, d + 1)
     few = FEW if N >= MANY else 0
     floats = (
-        (18 + d + N_POINT_FEATURES + 3) * N  # vectors over the points, copied rows, features, votes
+        (22 + 2 * d + N_POINT_FEATURES + 3) * N  # vectors over the points, copied rows, features, votes
         + 6 * wide
-        + n * n * 5 + n * 7 + 2 * n * (n + 2)  # vertices and tables
+        + n * n * 6 + n * 8 + 2 * n * (n + 2)  # vertices and tables
         + d * (d + 1) + 6 * d + KEPT * (d + 1) + MEMORY * d  # models
         + 6 + few * (d + 2)
         + 2 * BLOCK * int(point_net.widths.max()) + 2 * int(peel_net.widths.max())
         + n * N_PEEL_FEATURES * (1 + log_steps)
     )  # fmt: skip
-    integers = N_COUNTS + (6 + 2 * n) * N + 8 * n + d + BINS + log_steps * n
+    integers = N_COUNTS + (9 + 2 * n) * N + 9 * n + d + BINS + log_steps * n
     return Arena(
         rows.At,
         rows.b,
@@ -182,6 +183,7 @@ def carve(arena: Arena) -> Search:
     copies_r, f = _cut2(F, f, 2, N)
     tried, g = _cut(B, g, N)
     fresh, g = _cut(B, g, N)
+    waiting, k = _cut(K, k, N)
     bound, f = _cut(F, f, N)
     leave, k = _cut(K, k, N)
     certificate, k = _cut2(K, k, N, n)
@@ -190,8 +192,21 @@ def carve(arena: Arena) -> Search:
     kept, g = _cut(B, g, N)
     dropped, g = _cut(B, g, N)
     blame, k = _cut(K, k, N)
+    near_points, k = _cut(K, k, N)
+    near_place, k = _cut(K, k, N)
+    near_At, f = _cut(F, f, d * N)
+    near_b, f = _cut(F, f, N)
+    near_gain, f = _cut(F, f, N)
+    near_cap, f = _cut(F, f, N)
+    near_r, f = _cut(F, f, N)
+    near_C, f = _cut2(F, f, n, n)
+    near_x, f = _cut(F, f, n)
+    near_q, k = _cut(K, k, n)
+    near = NearRows(near_points, near_place, near_At, near_b, near_gain, near_cap, near_r, near_C, near_x, near_q)
     copies = VertexCopies(copies_C, copies_x, copies_q, copies_r)
-    refinement = RefineScratch(copies, tried, fresh, bound, leave, certificate, before, basis, kept, dropped, blame)
+    refinement = RefineScratch(
+        copies, tried, fresh, waiting, bound, leave, certificate, before, basis, kept, dropped, blame, near
+    )
 
     pool, k = _cut(K, k, N)
     inliers, k = _cut(K, k, N)

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from maxcon.minimax.jit import kernel
 from maxcon.minimax.linear import compute_residuals
+from maxcon.minimax.rows import dot
 from maxcon.search.random_kernels import draw_next
 
 #: A row counts as dependent on those before it where elimination leaves less than this of its largest
@@ -148,26 +149,6 @@ def substitute_back(rank: int, table: NDArray[np.float64], places: NDArray[np.in
 
 
 @kernel
-def _dot(u: NDArray[np.float64], v: NDArray[np.float64]) -> float:
-    """Return u . v, summed in eight lanes (a single sum may not be reordered, so it would not vectorise)."""
-    n = u.shape[0]
-    s0 = s1 = s2 = s3 = s4 = s5 = s6 = s7 = 0.0
-    whole = n - n % 8
-    for i in range(0, whole, 8):
-        s0 += u[i] * v[i]
-        s1 += u[i + 1] * v[i + 1]
-        s2 += u[i + 2] * v[i + 2]
-        s3 += u[i + 3] * v[i + 3]
-        s4 += u[i + 4] * v[i + 4]
-        s5 += u[i + 5] * v[i + 5]
-        s6 += u[i + 6] * v[i + 6]
-        s7 += u[i + 7] * v[i + 7]
-    for i in range(whole, n):
-        s0 += u[i] * v[i]
-    return ((s0 + s4) + (s1 + s5)) + ((s2 + s6) + (s3 + s7))
-
-
-@kernel
 def weighted_model(
     At: NDArray[np.float64],
     b: NDArray[np.float64],
@@ -186,8 +167,8 @@ def weighted_model(
         for i in range(N):
             weighted[i] = w[i] * a[i]
         for k in range(j + 1):
-            table[j, k] = _dot(weighted, At[k])
-        table[j, d] = _dot(weighted, b)
+            table[j, k] = dot(weighted, At[k])
+        table[j, d] = dot(weighted, b)
     solve_normal_equations(table, x)
 
 

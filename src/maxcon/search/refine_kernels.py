@@ -38,6 +38,7 @@ from maxcon.minimax.linear import (
     basis_points,
 )
 from maxcon.minimax.simplex import FREE_TOLERANCE
+from maxcon.search.trial_kernels import NearRows, allocate_near, gather_near, near_forbid
 from maxcon.search.vertex_kernels import (
     VertexCopies,
     add_point,
@@ -52,6 +53,10 @@ from maxcon.search.vertex_kernels import (
 COEFFICIENT_FLOOR = 1e-13
 
 
+#: Where fewer than one in so many points may still be added, their bounds are computed one by one.
+FEW_OF = 4
+
+
 class RefineScratch(NamedTuple):
     """Scratch space of the refinement kernels, for one problem.
 
@@ -63,6 +68,8 @@ class RefineScratch(NamedTuple):
         Shape (N,), bool: points that are not to be tried (again).
     fresh
         Shape (N,), bool: points added on the word of a witness, until the fit confirms it.
+    waiting
+        Shape (N,): the points that may still be added.
     bound, leave
         Shape (N,) each: a lower bound on f(S + i), and the basis row without which the rest proves it.
     certificate
@@ -74,11 +81,14 @@ class RefineScratch(NamedTuple):
     kept, dropped, blame
         Shape (N,) each: the set of which a point is being swapped, the points that were dropped from it in
         vain, and in how many certificates each point is.
+    near
+        Room for trials on a few points.
     """
 
     copies: VertexCopies
     tried: NDArray[np.bool_]
     fresh: NDArray[np.bool_]
+    waiting: NDArray[np.int64]
     bound: NDArray[np.float64]
     leave: NDArray[np.int64]
     certificate: NDArray[np.int64]
@@ -87,6 +97,7 @@ class RefineScratch(NamedTuple):
     kept: NDArray[np.bool_]
     dropped: NDArray[np.bool_]
     blame: NDArray[np.int64]
+    near: NearRows
 
 
 def allocate_refinement(rows: LinearRows) -> RefineScratch:
@@ -96,6 +107,7 @@ def allocate_refinement(rows: LinearRows) -> RefineScratch:
         allocate_copies(rows, 2),
         np.zeros(N, dtype=np.bool_),
         np.zeros(N, dtype=np.bool_),
+        np.zeros(N, dtype=np.int64),
         np.zeros(N),
         np.zeros(N, dtype=np.int64),
         np.full((N, d + 1), -1, dtype=np.int64),
@@ -104,6 +116,7 @@ def allocate_refinement(rows: LinearRows) -> RefineScratch:
         np.zeros(N, dtype=np.bool_),
         np.zeros(N, dtype=np.bool_),
         np.zeros(N, dtype=np.int64),
+        allocate_near(rows),
     )
 
 
@@ -151,6 +164,34 @@ def addition_bounds(ws: Workspace, bound: NDArray[np.float64], leave: NDArray[np
     for i in range(N):
         t = bound[i] if bound[i] < np.inf else 0.0
         bound[i] = gamma + t * max(abs(r[i]) - gamma, 0.0)
+
+
+@kernel
+def addition_bounds_of(
+    ws: Workspace, points: NDArray[np.int64], count: int, bound: NDArray[np.float64], leave: NDArray[np.int64]
+) -> None:
+    """Do what `addition_bounds` does for ``points[:count]`` only, one point at a time: for when they are few."""
+    At, C, q, r = ws.At, ws.C, ws.q, ws.r
+    n = q.shape[0]
+    gamma = ws.x[n - 1]
+    for m in range(count):
+        i = points[m]
+        least, row = np.inf, -1
+        free = False
+        for k in range(n):
+            w = 0.0
+            for j in range(n - 1):
+                w += C[j, k] * At[j, i]
+            if q[k] < 0 and q[k] > -n:
+                if abs(w) > FREE_TOLERANCE:
+                    least, row, free = 0.0, -1, True
+                continue
+            coefficient = C[n - 1, k] + (w if r[i] >= 0.0 else -w)
+            t = max(C[n - 1, k], 0.0) / coefficient if coefficient > COEFFICIENT_FLOOR else np.inf
+            if not free and t < least:
+                least, row = t, k
+        bound[i] = gamma + (least if least < np.inf else 0.0) * max(abs(r[i]) - gamma, 0.0)
+        leave[i] = row
 
 
 @kernel
@@ -215,29 +256,46 @@ def _write_certificate(
 
 
 @kernel
-def _most_promising(ws: Workspace, limit: float, scratch: RefineScratch, moved: bool, least: int) -> int:
-    """Return the point with the smallest bound on f(S + i); -1 if fewer than `least` points may still fit.
+def _list_waiting(ws: Workspace, limit: float, scratch: RefineScratch) -> int:
+    """Write the points that may still be added at this vertex into ``scratch.waiting``; return how many there are.
 
-    The bounds are computed anew if the vertex has `moved`.
+    What the bounds rule out is marked as tried, with its certificate.
     """
-    cap, tried, bound = ws.cap, scratch.tried, scratch.bound
-    C, q, leave, certificate = ws.C, ws.q, scratch.leave, scratch.certificate
-    best = -1
-    count = 0
+    cap, tried, waiting = ws.cap, scratch.tried, scratch.waiting
+    bound, leave, certificate = scratch.bound, scratch.leave, scratch.certificate
+    C, q = ws.C, ws.q
+    N = tried.shape[0]
     margin = limit + _rounding(ws.x)
-    if moved:
+    m = 0
+    for i in range(N):
+        if not tried[i] and cap[i] == np.inf:
+            waiting[m] = i
+            m += 1
+    if FEW_OF * m < N:
+        addition_bounds_of(ws, waiting, m, bound, leave)
+    else:
         addition_bounds(ws, bound, leave)
-    for i in range(tried.shape[0]):
-        if tried[i] or cap[i] != np.inf:
-            continue
+    count = 0
+    for k in range(m):
+        i = waiting[k]
         if bound[i] > margin:
             tried[i] = True
             _write_certificate(C, q, leave[i], i, certificate)
-            continue
-        count += 1
-        if best < 0 or bound[i] < bound[best]:
-            best = i
-    return best if count >= least else -1
+        else:
+            waiting[count] = i
+            count += 1
+    return count
+
+
+@kernel
+def _most_promising(waiting: NDArray[np.int64], count: int, bound: NDArray[np.float64]) -> int:
+    """Return which of ``waiting[:count]`` has the smallest bound on f(S + i), of equal ones the first point."""
+    best = 0
+    for k in range(1, count):
+        i, other = waiting[k], waiting[best]
+        if bound[i] < bound[other] or (bound[i] == bound[other] and i < other):
+            best = k
+    return best
 
 
 @kernel
@@ -266,19 +324,31 @@ def refine_kernel(ws: Workspace, limit: float, scratch: RefineScratch) -> int:
 def _refine(ws: Workspace, limit: float, scratch: RefineScratch, least: int) -> int:
     """Do what `refine_kernel` does, but give up as soon as fewer than `least` points can be added in all."""
     n = ws.x.shape[0]
+    waiting, near, certificate = scratch.waiting, scratch.near, scratch.certificate
     added = _add_witnessed(ws, limit, scratch)
     moved = True
+    count = m = 0
     while True:
-        point = _most_promising(ws, limit, scratch, moved, max(least - added, 1))
-        if point < 0:
+        if moved:
+            count = _list_waiting(ws, limit, scratch)
+            m = gather_near(ws, near)
+        if count < max(least - added, 1):
             return added
+        best = _most_promising(waiting, count, scratch.bound)
+        point = waiting[best]
+        count -= 1
+        waiting[best] = waiting[count]
         scratch.tried[point] = True
+        if m > 0 and near_forbid(ws, limit, near, m, point):
+            _write_certificate(near.C, near.q, -1, point, certificate)
+            moved = False
+            continue
         save_vertex(ws, scratch.copies, 0)
         moved = add_point(ws, point, limit) == OK and ws.x[n - 1] <= limit
         if moved:
             added += 1 + _add_witnessed(ws, limit, scratch)
         else:
-            _write_certificate(ws.C, ws.q, -1, point, scratch.certificate)
+            _write_certificate(ws.C, ws.q, -1, point, certificate)
             ws.gain[point] = 0.0
             ws.cap[point] = np.inf
             load_vertex(ws, scratch.copies, 0)
