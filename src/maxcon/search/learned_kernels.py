@@ -16,7 +16,7 @@ from maxcon.minimax.jit import kernel
 from maxcon.minimax.linear import OK, cold_fit, compute_residuals
 from maxcon.problem.validate import check_number
 from maxcon.search.belief import SHRINK, agreement, forget_votes, root_models, start_belief, update_belief
-from maxcon.search.belief_proposals import KEPT, MANY, propose, refine_proposals, same_model
+from maxcon.search.belief_proposals import KEPT, propose, refine_proposals, same_model
 from maxcon.search.gnc_kernels import descend
 from maxcon.search.learned_memory import (
     AGREEMENT,
@@ -34,9 +34,9 @@ from maxcon.search.learned_memory import (
     Search,
     carve,
 )
-from maxcon.search.model_kernels import count_within, least_squares_model
+from maxcon.search.model_kernels import count_within, least_squares_model, weighted_model
 from maxcon.search.peel_walk import choose_start, install_walk, walk_down
-from maxcon.search.random_kernels import draw_next, random_below
+from maxcon.search.random_kernels import draw_next, random_below, random_unit
 from maxcon.search.refine_kernels import refine_kernel, swap_kernel
 from maxcon.search.vertex_kernels import load_vertex, save_vertex
 
@@ -75,12 +75,15 @@ class Settings(NamedTuple):
         The mean belief in the incumbent's points from which on it is swapped, one round later.
     explore
         How often a walk removes a random basis point; for training.
-    variations, sure
-        How many walks start from variations of the incumbent, thrice as many with more than `MANY` points; and `sure`
-        times as many where the mean belief in the incumbent's points is above `agreed`.
+    variations
+        How many variations of the incumbent are walked from where the mean belief in its points is above `agreed`.
     least, most
-        A variation is the least-squares model of a random number of the incumbent's points: between these, in times
-        of r.
+        One kind of variation is the least-squares model of a random number of the incumbent's points: between these,
+        in times of r.
+    forced, span, loose, pull
+        The other kind, `forced` of all: a robust refit in which a random point outside, within `span` limits, has
+        the weight of `pull` times all of the incumbent's points, and from there, without it, a descent that starts
+        where residuals of `loose` limits still count.
     """
 
     samples: int = 100
@@ -93,10 +96,13 @@ class Settings(NamedTuple):
     patience: int = 5
     agreed: float = 0.85
     explore: float = 0.0
-    variations: int = 6
+    variations: int = 8
     least: int = 2
     most: int = 8
-    sure: int = 4
+    forced: float = 0.5
+    span: float = 30.0
+    loose: float = 2.0
+    pull: float = 1.0
 
 
 #: The least and the largest value of each setting.
@@ -112,9 +118,12 @@ _RANGES = {
     "agreed": (0.0, 2.0),
     "explore": (0.0, 1.0),
     "variations": (0, 10**6),
-    "sure": (1, 1000),
     "least": (1, 1000),
     "most": (1, 1000),
+    "forced": (0.0, 1.0),
+    "span": (1.0, 1e6),
+    "loose": (1.0, 1e6),
+    "pull": (0.0, 1e6),
 }
 
 
@@ -305,26 +314,60 @@ def walk_part(search: Search, limit: float, settings: Settings, which: int) -> N
 
 @kernel
 def vary_part(search: Search, limit: float, settings: Settings) -> None:
-    """Walk from least-squares models of a few of the incumbent's points each."""
+    """Walk from variations of the incumbent."""
+    if search.counts[AGREEMENT] <= 1000.0 * settings.agreed:
+        return
+    for _ in range(settings.variations):
+        if random_unit(search.scratch.state) < settings.forced:
+            force_in(search, limit, settings)
+        else:
+            vary(search, limit, settings)
+
+
+@kernel
+def vary(search: Search, limit: float, settings: Settings) -> None:
+    """Walk from the least-squares model of a few of the incumbent's points."""
     ws, scratch, member = search.ws, search.scratch, search.member
     d = search.x.shape[0]
-    count = settings.variations * (3 if member.shape[0] > MANY else 1)
-    if search.counts[AGREEMENT] > 1000.0 * settings.agreed:
-        count *= settings.sure
-    for _ in range(count):
-        size = 0
-        for i in range(member.shape[0]):
-            if member[i]:
-                scratch.inliers[size] = i
-                size += 1
-        few = d * (settings.least + random_below(scratch.state, max(settings.most - settings.least, 0) + 1))
-        few = min(few, size // 2)
-        if few <= d:
-            return
-        for k in range(few):
-            draw_next(scratch.state, scratch.inliers, k, size)
-        least_squares_model(ws.At, ws.b, scratch.inliers, few, scratch.table, scratch.x)
-        walk_from(search, limit, settings, scratch.x, False)
+    size = 0
+    for i in range(member.shape[0]):
+        if member[i]:
+            scratch.inliers[size] = i
+            size += 1
+    few = d * (settings.least + random_below(scratch.state, max(settings.most - settings.least, 0) + 1))
+    few = min(few, size // 2)
+    if few <= d:
+        return
+    for k in range(few):
+        draw_next(scratch.state, scratch.inliers, k, size)
+    least_squares_model(ws.At, ws.b, scratch.inliers, few, scratch.table, scratch.x)
+    walk_from(search, limit, settings, scratch.x, False)
+
+
+@kernel
+def force_in(search: Search, limit: float, settings: Settings) -> None:
+    """Walk from a local minimum near the incumbent that is led through a point outside."""
+    ws, scratch, member = search.ws, search.scratch, search.member
+    x, r, w = scratch.x, scratch.r, scratch.w
+    N = member.shape[0]
+    compute_residuals(ws.At, ws.b, search.x, r)
+    size = 0
+    for i in range(N):
+        if not member[i] and abs(r[i]) <= settings.span * limit:
+            scratch.inliers[size] = i
+            size += 1
+    if size == 0:
+        return
+    point = scratch.inliers[random_below(scratch.state, size)]
+    s = settings.loose * settings.loose * limit * limit
+    for i in range(N):
+        share = s / (r[i] * r[i] + s)
+        w[i] = share * share
+    w[point] = settings.pull * search.counts[SIZE]
+    weighted_model(ws.At, ws.b, w, scratch.weighted, scratch.table, x)
+    descend(ws.At, ws.b, limit, settings.loose * settings.loose, SHRINK, 1000, scratch, x, scratch.trial, -1)
+    if _is_new_start(search, limit, x):
+        walk_from(search, limit, settings, x, False)
 
 
 @kernel
