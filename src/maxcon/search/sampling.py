@@ -180,8 +180,10 @@ def _draw(task: Task, total: int, confidence: float, local: _LocalOptimisation) 
     chunk, longest = FIRST_CHUNK, _longest_chunk(rank, n_points)
     settings = (local.inner, local.inner_size, local.wide, local.steps, local.most, n_points >= PAUSE_FROM)
     while drawn < total:
+        before, left = drawn, task.seconds_left()
         last = min(drawn + min(chunk, longest), total)
         found, drawn, confident = sample(At, b, task.limit, confidence, drawn, last, *settings, scratch, best, size)
+        each = (left - task.seconds_left()) / max(drawn - before, 1) if left < np.inf else 0.0
         if found > max(size, 0):
             yield Step(subset=inlier_mask(task.rows, best, task.limit))
         else:
@@ -190,3 +192,5 @@ def _draw(task: Task, total: int, confidence: float, local: _LocalOptimisation) 
         if confident:
             return
         chunk *= 2
+        if left < np.inf:  # no more than the time that is left lets one draw
+            chunk = max(1, min(chunk, int(task.seconds_left() / max(each, 1e-9))))
