@@ -100,6 +100,8 @@ def _distribute(
 
 
 def _as_completed(work: Callable[[T], R], units: Sequence[T], jobs: int, backend: str) -> Iterator[R]:
+    # To loky, kernels being compiled in a worker look like a leak of memory: it replaces the worker; nothing is lost.
+    warnings.filterwarnings("ignore", "A worker stopped while some jobs", UserWarning)
     with joblib.parallel_config(backend=backend, n_jobs=jobs):
         # Units take seconds, so that batches would only make a kill lose more.
         parallel = joblib.Parallel(return_as="generator_unordered", batch_size=1, pre_dispatch="2*n_jobs")
