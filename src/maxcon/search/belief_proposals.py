@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from maxcon.minimax.jit import kernel
 from maxcon.minimax.linear import compute_residuals
 from maxcon.search.belief import RAW, SHARP, SHRINK, SOFT, Belief, cast_vote, nearness
-from maxcon.search.gnc_kernels import descend
+from maxcon.search.gnc_kernels import descend, local_start
 from maxcon.search.model_kernels import count_within, eliminate_point, substitute_back
 from maxcon.search.random_kernels import draw_next, random_unit
 from maxcon.search.sampling_kernels import Scratch
@@ -191,6 +191,7 @@ def refine_proposals(
 ) -> int:
     """Move the best `count` proposals to a local minimum of the loss, rank them again, let them vote.
 
+    A minimum near them, from where residuals of `local` limits still count; infinity: from where half the points do.
     `best` takes any model met that explains more than `size` points; returns the new size.
     """
     d = At.shape[0]
@@ -218,6 +219,8 @@ def refine_proposals(
         for j in range(d):
             x[j] = models[k, j]
         control = local * local
+        if local == np.inf:
+            control = local_start(At, b, limit, scratch, x)
         if m > 0:
             descend(proposals.few_rows, proposals.few_b, limit, control, SHRINK, 1000, brief, x, proposals.best, -1)
             control = min(control, POLISH)

@@ -63,6 +63,9 @@ COARSE, COARSER, COARSE_ROUNDS, COARSE_SHARE = 200, 6, 8, 0.3
 #: has been spent.
 AFRESH = 3.0
 
+#: Of many points, the first incumbent is swapped at once where there is so much of the time left that it took.
+SWAP_FIRST = 0.6
+
 #: Until a round has been timed: what it takes, in times of the root.
 ROUND_ROOTS = 1.6
 
@@ -136,6 +139,9 @@ def _search(task: Task, nets: SearchNetworks, rounds: int | None, settings: Sett
     pieces = [(k, k + 1) for k in range(PARTS)] if task.problem.n_points > MANY else [(0, PARTS)]
     took = [ROUND_ROOTS * (now - began) / len(pieces)] * len(pieces)
     reported = 0
+    if task.problem.n_points > MANY and task.deadline - now > SWAP_FIRST * (now - began):
+        finish_search(arena, limit)
+        now = time.perf_counter()
     while rounds is None or counts[ROUND] < rounds:
         for number, (first, last) in enumerate(pieces):
             if task.deadline - now <= PIECE_FITS * took[number]:

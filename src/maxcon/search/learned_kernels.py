@@ -84,6 +84,9 @@ class Settings(NamedTuple):
         The other kind, `forced` of all: a robust refit in which a random point outside, within `span` limits, has
         the weight of `pull` times all of the incumbent's points, and from there, without it, a descent that starts
         where residuals of `loose` limits still count.
+    lost
+        In this one of every `patience` rounds without progress, where the belief does not agree with the incumbent, the
+        samples are drawn without regard to it, and refined from where half the points still count.
     """
 
     samples: int = 100
@@ -103,6 +106,7 @@ class Settings(NamedTuple):
     span: float = 30.0
     loose: float = 2.0
     pull: float = 1.0
+    lost: int = 2
 
 
 #: The least and the largest value of each setting.
@@ -124,6 +128,7 @@ _RANGES = {
     "span": (1.0, 1e6),
     "loose": (1.0, 1e6),
     "pull": (0.0, 1e6),
+    "lost": (0, 100),
 }
 
 
@@ -374,7 +379,11 @@ def force_in(search: Search, limit: float, settings: Settings) -> None:
 def propose_part(search: Search, limit: float, settings: Settings) -> None:
     """Draw and refine proposals; a model that explains more than the incumbent replaces it."""
     ws, belief, scratch = search.ws, search.belief, search.scratch
-    power = settings.power / (1.0 + settings.soften * max(search.counts[STALL], 0))
+    stall, local = max(search.counts[STALL], 0), settings.local
+    power = settings.power / (1.0 + settings.soften * stall)
+    doubtful = search.counts[AGREEMENT] <= 1000.0 * settings.agreed
+    if doubtful and stall > 0 and stall % settings.patience == settings.lost:
+        power, local = 0.0, np.inf  # what the belief favours has come to nothing: start from anywhere
     propose(ws.At, ws.b, limit, settings.samples, power, settings.floor, belief, search.proposals, scratch)
     size = search.counts[SIZE]
     found = refine_proposals(
@@ -382,7 +391,7 @@ def propose_part(search: Search, limit: float, settings: Settings) -> None:
         ws.b,
         limit,
         settings.refined,
-        settings.local,
+        local,
         belief,
         search.proposals,
         scratch,
