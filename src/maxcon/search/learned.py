@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from maxcon.agent.search_networks import SearchNetworks, load_search_networks, shipped_search_networks
 from maxcon.minimax import LinearRows
+from maxcon.minimax.jit import compile_seconds
 from maxcon.search.anytime import Step, Task
 from maxcon.search.belief_proposals import MANY
 from maxcon.search.learned_kernels import (
@@ -131,35 +132,41 @@ def learned(
 
 
 def _search(task: Task, nets: SearchNetworks, rounds: int | None, settings: Settings) -> Iterator[Step]:
-    began = time.perf_counter()
+    began = _clock()
+    end = began + task.seconds_left()
     arena = _root(task, nets, settings)
     counts, member, limit = arena.integers[:N_COUNTS], arena.flags[: task.problem.n_points], task.limit
-    now = spoken = time.perf_counter()
+    now = spoken = _clock()
     # Of many points, a round takes so long that the clock is looked at between its parts.
     pieces = [(k, k + 1) for k in range(PARTS)] if task.problem.n_points > MANY else [(0, PARTS)]
     took = [ROUND_ROOTS * (now - began) / len(pieces)] * len(pieces)
     reported = 0
-    if task.problem.n_points > MANY and task.deadline - now > SWAP_FIRST * (now - began):
+    if task.problem.n_points > MANY and end - now > SWAP_FIRST * (now - began):
         finish_search(arena, limit)
-        now = time.perf_counter()
+        now = _clock()
     while rounds is None or counts[ROUND] < rounds:
         for number, (first, last) in enumerate(pieces):
-            if task.deadline - now <= PIECE_FITS * took[number]:
+            if end - now <= PIECE_FITS * took[number]:
                 break
             play_parts(arena, limit, settings, first, last)
-            done = time.perf_counter()
+            done = _clock()
             took[number], now = max(0.8 * took[number], done - now), done
         else:
-            if task.deadline == np.inf and rounds is None and _is_settled(counts):
+            if end == np.inf and rounds is None and _is_settled(counts):
                 break
-            if now - spoken > PAUSE and task.deadline - now > 2.0 * sum(took):
+            if now - spoken > PAUSE and end - now > 2.0 * sum(took):
                 yield _news(counts, member, reported)
                 reported, spoken = int(counts[SIZE]), now
             continue
         break
-    if not counts[SWAPPED] and task.deadline - now > SWAP_ROUNDS * sum(took):
+    if not counts[SWAPPED] and end - now > SWAP_ROUNDS * sum(took):
         finish_search(arena, limit)
     yield _news(counts, member, reported)
+
+
+def _clock() -> float:
+    """Return the time in seconds, from some moment on, without what compiling takes."""
+    return time.perf_counter() - compile_seconds()
 
 
 def _root(task: Task, nets: SearchNetworks, settings: Settings) -> Arena:
@@ -168,8 +175,7 @@ def _root(task: Task, nets: SearchNetworks, settings: Settings) -> Arena:
     sizes = [N]
     while sizes[-1] > MANY:
         sizes.append(max(sizes[-1] // COARSER, COARSE))
-    began, brief, coarse = time.perf_counter(), settings._replace(variations=0), None
-    left = task.deadline - began
+    began, left, brief, coarse = _clock(), task.seconds_left(), settings._replace(variations=0), None
     for size in reversed(sizes):
         rows = task.rows if size == N else _some(task.rows, task.rng.choice(N, size, replace=False))
         arena = allocate_arena(rows, seed_state(task.rng), nets.points, nets.peel)
@@ -177,10 +183,10 @@ def _root(task: Task, nets: SearchNetworks, settings: Settings) -> Arena:
         if coarse is None:
             begin_search(arena, task.limit)
         else:
-            afresh = not _agrees(coarse.integers) and AFRESH * (time.perf_counter() - began) < left
+            afresh = not _agrees(coarse.integers) and AFRESH * (_clock() - began) < left
             begin_search_above(arena, task.limit, coarse, settings, afresh)
         while size < N and counts[ROUND] < COARSE_ROUNDS and not (counts[ROUND] > 0 and _agrees(counts)):
-            if counts[ROUND] > 0 and time.perf_counter() - began > COARSE_SHARE * left:
+            if counts[ROUND] > 0 and _clock() - began > COARSE_SHARE * left:
                 break
             play_rounds(arena, task.limit, brief, 1)
         coarse = arena
