@@ -83,6 +83,7 @@ def judge(cell: str, chosen: list[str], options: argparse.Namespace) -> list[dic
         problem, threshold = make_problem(family, stream, int(n_points), float(rate))
         known = 0
         rows = []
+        fit(problem, threshold, table[chosen[0]], 1e-3, 0)  # the first run of a problem finds cold caches
         for name in chosen:
             if name == "exact" and problem.n_params > 3:
                 continue

@@ -30,6 +30,7 @@ from maxcon.search.exact import exact
 from maxcon.search.learned import learned
 from maxcon.search.learned_kernels import (
     PARTS,
+    WALK_INCUMBENT,
     Settings,
     begin_search,
     begin_search_above,
@@ -303,6 +304,7 @@ def test_a_search_above_takes_the_incumbent_of_the_one_below(afresh):
     play_rounds(coarse, task.limit, Settings(), 2)
     arena = arena_for(task)
     begin_search_above(arena, task.limit, coarse, Settings(), afresh)
+    play_parts(arena, task.limit, Settings(), WALK_INCUMBENT, WALK_INCUMBENT + 1)
     above, below = carve(arena), carve(coarse)
     assert above.member.sum() >= 320
     assert (above.l1 == below.l1).all() != afresh

@@ -22,6 +22,7 @@ from maxcon.search.anytime import Step, Task
 from maxcon.search.belief_proposals import MANY
 from maxcon.search.learned_kernels import (
     PARTS,
+    WALK_INCUMBENT,
     Settings,
     begin_search,
     begin_search_above,
@@ -63,6 +64,9 @@ COARSE, COARSER, COARSE_ROUNDS, COARSE_SHARE = 200, 6, 8, 0.3
 #: Where it does not agree in the end, the models of all points are made too, if there are so many times as much time as
 #: has been spent.
 AFRESH = 3.0
+
+#: A walk takes about the number of points to this power; one that would pass the time limit is not begun.
+WALK_GROWTH = 1.5
 
 #: Of many points, the first incumbent is swapped at once where there is so much of the time left that it took.
 SWAP_FIRST = 0.6
@@ -175,7 +179,7 @@ def _root(task: Task, nets: SearchNetworks, settings: Settings) -> Arena:
     sizes = [N]
     while sizes[-1] > MANY:
         sizes.append(max(sizes[-1] // COARSER, COARSE))
-    began, left, brief, coarse = _clock(), task.seconds_left(), settings._replace(variations=0), None
+    began, left, brief, coarse, walk = _clock(), task.seconds_left(), settings._replace(variations=0), None, 0.0
     for size in reversed(sizes):
         rows = task.rows if size == N else _some(task.rows, task.rng.choice(N, size, replace=False))
         arena = allocate_arena(rows, seed_state(task.rng), nets.points, nets.peel)
@@ -185,6 +189,10 @@ def _root(task: Task, nets: SearchNetworks, settings: Settings) -> Arena:
         else:
             afresh = not _agrees(coarse.integers) and AFRESH * (_clock() - began) < left
             begin_search_above(arena, task.limit, coarse, settings, afresh)
+            before = _clock()
+            if walk * COARSER**WALK_GROWTH < left - (before - began):
+                play_parts(arena, task.limit, settings, WALK_INCUMBENT, WALK_INCUMBENT + 1)
+                walk = _clock() - before
         while size < N and counts[ROUND] < COARSE_ROUNDS and not (counts[ROUND] > 0 and _agrees(counts)):
             if counts[ROUND] > 0 and _clock() - began > COARSE_SHARE * left:
                 break

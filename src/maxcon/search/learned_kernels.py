@@ -41,7 +41,7 @@ from maxcon.search.refine_kernels import refine_kernel, swap_kernel
 from maxcon.search.vertex_kernels import load_vertex, save_vertex
 
 #: The parts of a round, in order; walks 0 and 1 start from proposals, 2 from the incumbent, the rest from variations.
-PROPOSE, WALK, VARY, BELIEVE, SWAP, PARTS = 0, 1, 4, 5, 6, 7
+PROPOSE, WALK, WALK_INCUMBENT, VARY, BELIEVE, SWAP, PARTS = 0, 1, 3, 4, 5, 6, 7
 
 #: Two starts are the same where their residuals differ by less than this many limits, root mean square.
 SAME_START = 0.1
@@ -461,10 +461,8 @@ def begin_search(arena: Arena, limit: float) -> None:
 
 @kernel
 def begin_search_above(arena: Arena, limit: float, coarse: Arena, settings: Settings, afresh: bool) -> None:
-    """Do the root from what a search on some of the points has found, and walk from there; see `begin_above`."""
-    search = carve(arena)
-    begin_above(search, limit, carve(coarse), settings.local, afresh)
-    play(search, limit, settings, VARY - 1, VARY)
+    """Do the root from what a search on some of the points has found; see `begin_above`."""
+    begin_above(carve(arena), limit, carve(coarse), settings.local, afresh)
 
 
 @kernel
