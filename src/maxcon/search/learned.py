@@ -65,8 +65,9 @@ COARSE, COARSER, COARSE_ROUNDS, COARSE_SHARE = 200, 6, 8, 0.3
 #: has been spent.
 AFRESH = 3.0
 
-#: A walk takes about the number of points to this power; one that would pass the time limit is not begun.
-WALK_GROWTH = 1.5
+#: A walk takes about the number of points to this power. A root's last walk is worth more than all before it: one that
+#: would pass the time limit is begun if it passes it by no more than half of what has been spent.
+WALK_GROWTH, OVERRUN = 1.5, 0.5
 
 #: Of many points, the first incumbent is swapped at once where there is so much of the time left that it took.
 SWAP_FIRST = 0.6
@@ -145,9 +146,12 @@ def _search(task: Task, nets: SearchNetworks, rounds: int | None, settings: Sett
     pieces = [(k, k + 1) for k in range(PARTS)] if task.problem.n_points > MANY else [(0, PARTS)]
     took = [ROUND_ROOTS * (now - began) / len(pieces)] * len(pieces)
     reported = 0
-    if task.problem.n_points > MANY and end - now > SWAP_FIRST * (now - began):
-        finish_search(arena, limit)
-        now = _clock()
+    if len(pieces) > 1:
+        yield _news(counts, member, reported)
+        reported, spoken = int(counts[SIZE]), now
+        if end - now > SWAP_FIRST * (now - began):
+            finish_search(arena, limit)
+            now = _clock()
     while rounds is None or counts[ROUND] < rounds:
         for number, (first, last) in enumerate(pieces):
             if end - now <= PIECE_FITS * took[number]:
@@ -155,12 +159,12 @@ def _search(task: Task, nets: SearchNetworks, rounds: int | None, settings: Sett
             play_parts(arena, limit, settings, first, last)
             done = _clock()
             took[number], now = max(0.8 * took[number], done - now), done
+            if now - spoken > PAUSE and (len(pieces) > 1 or end - now > 2.0 * took[0]):
+                yield _news(counts, member, reported)
+                reported, spoken = int(counts[SIZE]), now
         else:
             if end == np.inf and rounds is None and _is_settled(counts):
                 break
-            if now - spoken > PAUSE and end - now > 2.0 * sum(took):
-                yield _news(counts, member, reported)
-                reported, spoken = int(counts[SIZE]), now
             continue
         break
     if not counts[SWAPPED] and end - now > SWAP_ROUNDS * sum(took):
@@ -190,7 +194,7 @@ def _root(task: Task, nets: SearchNetworks, settings: Settings) -> Arena:
             afresh = not _agrees(coarse.integers) and AFRESH * (_clock() - began) < left
             begin_search_above(arena, task.limit, coarse, settings, afresh)
             before = _clock()
-            if walk * COARSER**WALK_GROWTH < left - (before - began):
+            if walk * COARSER**WALK_GROWTH < left - OVERRUN * (before - began):
                 play_parts(arena, task.limit, settings, WALK_INCUMBENT, WALK_INCUMBENT + 1)
                 walk = _clock() - before
         while size < N and counts[ROUND] < COARSE_ROUNDS and not (counts[ROUND] > 0 and _agrees(counts)):

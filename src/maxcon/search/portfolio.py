@@ -5,7 +5,7 @@
 | up to 3 | none, or enough for a proof (`PROOF_SECONDS`) | the exact search |
 | up to 3 | less | the learned search for `SHORT_SHARE` of the time, then the exact search |
 | more | none | `propose`, the learned search until it has settled, then `BRIEF_WORK` of the exact search |
-| more | up to `ALL_LEARNED` seconds | the learned search |
+| more | up to `ALL_LEARNED` seconds a point | the learned search |
 | more | more | `propose` and the learned search, at most `LONG_SHARE` of the time; then the exact search |
 """
 
@@ -31,9 +31,9 @@ PROOF_SECONDS = {0: 2e-6, 1: 2e-6, 2: 2e-6, 3: 4e-5}
 #: Where the time is too short for a proof, this part of it goes to the learned search first.
 SHORT_SHARE = 0.5
 
-#: With more than three parameters no proof is attempted in so little time, in seconds: what it would find or prove is
-#: less than what the learned search still gains.
-ALL_LEARNED = 0.02
+#: With more than three parameters no proof is attempted in so little time, in seconds a point: what it would find or
+#: prove is less than what the learned search still gains.
+ALL_LEARNED = 2e-4
 
 #: Of more points, `propose` takes longer than it is worth.
 PROPOSED_POINTS = 2000
@@ -67,7 +67,7 @@ def auto(task: Task, *, n_jobs: int = -1) -> Iterator[Step]:
         if left >= PROOF_SECONDS[task.problem.n_params] * task.problem.n_points:
             return prove(task, n_jobs=n_jobs)
         return _short(task, left)
-    if left <= ALL_LEARNED:
+    if left <= ALL_LEARNED * task.problem.n_points:
         return learned(task)
     return _long(task, left, n_jobs)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -11,7 +12,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from maxcon.datasets.cameras import epipolar_rows, transformed
 from maxcon.fitting import fit
+from maxcon.minimax.jit import compile_seconds
 from maxcon.problem import Consensus, check_threshold
+from maxcon.problem.validate import check_time_limit
 from maxcon.search.anytime import Progress
 from maxcon.vision.epipolar import (
     check_matches,
@@ -21,6 +24,9 @@ from maxcon.vision.epipolar import (
 )
 from maxcon.vision.estimate import smallest_directions
 from maxcon.vision.fundamental import LEAST_MATCHES, SAMPLES, FundamentalProblem, fundamental_problem
+
+#: What the search has of a time limit that posing the problem has used up, in seconds.
+LEAST_TIME = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,7 +109,8 @@ def find_fundamental(
     chart
         How the scale of F is fixed, and with it the residual: "auto", "F32=1" or "F33=1".
     method, time_limit, refine, gap, callback, **options
-        As for `maxcon.fit`. The time limit does not cover posing the problem (some milliseconds).
+        As for `maxcon.fit`. The time limit covers posing the problem, too, which it does not cut short: some 10 ms,
+        but .1 to .3 s for 2,000 matches of which a quarter is right.
     rng
         A seed or a NumPy generator, for the chart "auto" and for the search; None stands for the seed 0.
     refit
@@ -119,8 +126,13 @@ def find_fundamental(
         If an argument is not of this kind, the points of an image coincide, or N < 9; the message names it.
     """
     threshold = check_threshold(threshold)
+    check_time_limit(time_limit)
     first, second = check_matches(x1, x2, LEAST_MATCHES)
+    began, compiled = time.perf_counter(), compile_seconds()
     posed = fundamental_problem(first, second, chart=chart, threshold=threshold, rng=rng, samples=samples)
+    if time_limit is not None:
+        spent = time.perf_counter() - began - (compile_seconds() - compiled)
+        time_limit = max(time_limit - spent, LEAST_TIME)
     consensus = fit(
         posed.problem,
         threshold,
