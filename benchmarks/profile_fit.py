@@ -64,6 +64,7 @@ from maxcon.search.anytime import Task, make_task  # noqa: E402
 from maxcon.search.belief import MOST_LACK, TEMPERATURES  # noqa: E402
 from maxcon.search.belief_proposals import MANY  # noqa: E402
 from maxcon.search.learned_kernels import (  # noqa: E402
+    WALK_INCUMBENT,
     Settings,
     begin_search,
     begin_search_above,
@@ -121,11 +122,16 @@ def play_fit(problem: LinearProblem, threshold: float, rounds: int, log: Log) ->
             afresh = not method._agrees(coarse.integers)
             begin_search_above(arena, task.limit, coarse, settings, afresh)
             log(f"root above{level}", int(counts[SIZE]))
+            play_parts(arena, task.limit, settings, WALK_INCUMBENT, WALK_INCUMBENT + 1)
+            log(f"its walk{level}", int(counts[SIZE]))
         if size < N:
             while counts[ROUND] < method.COARSE_ROUNDS and not (counts[ROUND] > 0 and method._agrees(counts)):
                 play_rounds(arena, task.limit, settings._replace(variations=0), 1)
             log(f"rounds until it agrees{level}", int(counts[SIZE]))
         coarse = arena
+    if len(sizes) > 1:
+        finish_search(arena, task.limit)
+        log("first swap", int(counts[SIZE]))
     for number in range(rounds):
         for part, name in enumerate(PARTS):
             play_parts(arena, task.limit, settings, part, part + 1)
