@@ -25,8 +25,8 @@ from maxcon.search.proof import MOST_PARAMETERS, prove
 from maxcon.search.proposal import propose
 from maxcon.search.refine import swap_refinement
 
-#: Seconds a point that the exact search takes at 90% outliers, by the number of parameters.
-PROOF_SECONDS = {0: 2e-6, 1: 2e-6, 2: 2e-6, 3: 4e-5}
+#: Seconds a point that the exact search takes at 90% outliers and N = 1000, by the number of parameters.
+PROOF_SECONDS = {0: 9e-7, 1: 9e-7, 2: 9e-7, 3: 3e-5}
 
 #: Where the time is too short for a proof, this part of it goes to the learned search first.
 SHORT_SHARE = 0.5
