@@ -310,3 +310,10 @@ def test_a_search_above_takes_the_incumbent_of_the_one_below(afresh):
     assert (above.l1 == below.l1).all() != afresh
     assert_feasible(task, above.member)
     np.testing.assert_array_equal(np.isfinite(above.belief.p), True)
+
+
+@compiled_only
+def test_levels_hold_enough_points_for_many_parameters():
+    problem = synthetic_hyperplane(np.random.default_rng(17), 900, 0.3, 100)
+    task = make_task(problem, 0.1, np.random.default_rng(0))
+    assert run(task, learned(task, rounds=2), swap_refinement).size >= 630

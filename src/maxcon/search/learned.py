@@ -61,6 +61,9 @@ PAUSE = 0.002
 #: time, but one at least.
 COARSE, COARSER, COARSE_ROUNDS, COARSE_SHARE = 200, 6, 8, 0.3
 
+#: Fewer points than so many times the rank determine too little.
+COARSE_RANKS = 20
+
 #: Where it does not agree in the end, the models of all points are made too, if there are so many times as much time as
 #: has been spent.
 AFRESH = 3.0
@@ -148,7 +151,7 @@ def _search(task: Task, nets: SearchNetworks, rounds: int | None, settings: Sett
     reported = 0
     if len(pieces) > 1:
         yield _news(counts, member, reported)
-        reported, spoken = int(counts[SIZE]), now
+        reported, spoken = int(counts[SIZE]), (now := _clock())
         if end - now > SWAP_FIRST * (now - began):
             finish_search(arena, limit)
             now = _clock()
@@ -161,7 +164,7 @@ def _search(task: Task, nets: SearchNetworks, rounds: int | None, settings: Sett
             took[number], now = max(0.8 * took[number], done - now), done
             if now - spoken > PAUSE and (len(pieces) > 1 or end - now > 2.0 * took[0]):
                 yield _news(counts, member, reported)
-                reported, spoken = int(counts[SIZE]), now
+                reported, spoken = int(counts[SIZE]), (now := _clock())
         else:
             if end == np.inf and rounds is None and _is_settled(counts):
                 break
@@ -181,8 +184,9 @@ def _root(task: Task, nets: SearchNetworks, settings: Settings) -> Arena:
     """Return a search that has begun; where there are many points, above searches on fewer of them."""
     N = task.problem.n_points
     sizes = [N]
-    while sizes[-1] > MANY:
-        sizes.append(max(sizes[-1] // COARSER, COARSE))
+    least = max(COARSE, COARSE_RANKS * task.rows.At.shape[0])
+    while sizes[-1] > max(MANY, 2 * least):
+        sizes.append(max(sizes[-1] // COARSER, least))
     began, left, brief, coarse, walk = _clock(), task.seconds_left(), settings._replace(variations=0), None, 0.0
     for size in reversed(sizes):
         rows = task.rows if size == N else _some(task.rows, task.rng.choice(N, size, replace=False))
@@ -191,14 +195,14 @@ def _root(task: Task, nets: SearchNetworks, settings: Settings) -> Arena:
         if coarse is None:
             begin_search(arena, task.limit)
         else:
-            afresh = not _agrees(coarse.integers) and AFRESH * (_clock() - began) < left
+            afresh = not _agrees(coarse.integers[:N_COUNTS]) and AFRESH * (_clock() - began) < left
             begin_search_above(arena, task.limit, coarse, settings, afresh)
             before = _clock()
             if walk * COARSER**WALK_GROWTH < left - OVERRUN * (before - began):
                 play_parts(arena, task.limit, settings, WALK_INCUMBENT, WALK_INCUMBENT + 1)
                 walk = _clock() - before
         while size < N and counts[ROUND] < COARSE_ROUNDS and not (counts[ROUND] > 0 and _agrees(counts)):
-            if counts[ROUND] > 0 and _clock() - began > COARSE_SHARE * left:
+            if (coarse is not None or counts[ROUND] > 0) and _clock() - began > COARSE_SHARE * left:
                 break
             play_rounds(arena, task.limit, brief, 1)
         coarse = arena

@@ -4,8 +4,9 @@
 | --- | --- | --- |
 | up to 3 | none, or enough for a proof (`PROOF_SECONDS`) | the exact search |
 | up to 3 | less | the learned search for `SHORT_SHARE` of the time, then the exact search |
+| up to 3 | less than twice `EASY_SECONDS` a point | the learned search |
 | more | none | `propose`, the learned search until it has settled, then `BRIEF_WORK` of the exact search |
-| more | up to `ALL_LEARNED` seconds a point | the learned search |
+| more | up to `ALL_LEARNED` seconds a point, at most `MOST_LEARNED`, and no gap asked for | the learned search |
 | more | more | `propose` and the learned search, at most `LONG_SHARE` of the time; then the exact search |
 """
 
@@ -26,14 +27,20 @@ from maxcon.search.proposal import propose
 from maxcon.search.refine import swap_refinement
 
 #: Seconds a point that the exact search takes at 90% outliers and N = 1000, by the number of parameters.
-PROOF_SECONDS = {0: 9e-7, 1: 9e-7, 2: 9e-7, 3: 3e-5}
+PROOF_SECONDS = {0: 9e-7, 1: 9e-7, 2: 9e-7, 3: 4e-5}
 
 #: Where the time is too short for a proof, this part of it goes to the learned search first.
 SHORT_SHARE = 0.5
 
+#: Seconds a point that the exact search takes at 20% outliers: in less, no time is kept for it.
+EASY_SECONDS = 1e-6
+
 #: With more than three parameters no proof is attempted in so little time, in seconds a point: what it would find or
 #: prove is less than what the learned search still gains.
 ALL_LEARNED = 2e-4
+
+#: However many points there are, a proof is attempted in more time than this, in seconds, or where a gap is asked for.
+MOST_LEARNED = 1.0
 
 #: Of more points, `propose` takes longer than it is worth.
 PROPOSED_POINTS = 2000
@@ -67,12 +74,15 @@ def auto(task: Task, *, n_jobs: int = -1) -> Iterator[Step]:
         if left >= PROOF_SECONDS[task.problem.n_params] * task.problem.n_points:
             return prove(task, n_jobs=n_jobs)
         return _short(task, left)
-    if left <= ALL_LEARNED * task.problem.n_points:
+    if task.gap == 0 and left <= min(ALL_LEARNED * task.problem.n_points, MOST_LEARNED):
         return learned(task)
     return _long(task, left, n_jobs)
 
 
 def _short(task: Task, left: float) -> Iterator[Step]:
+    if (1.0 - SHORT_SHARE) * left < EASY_SECONDS * task.problem.n_points:
+        yield from learned(task)
+        return
     yield from learned(replace(task, deadline=task.deadline - (1.0 - SHORT_SHARE) * left))
     yield from prove(task)
 

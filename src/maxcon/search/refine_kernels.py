@@ -331,9 +331,10 @@ def _refine(ws: Workspace, limit: float, scratch: RefineScratch, least: int) -> 
     while True:
         if moved:
             count = _list_waiting(ws, limit, scratch)
-            m = gather_near(ws, near)
         if count < max(least - added, 1):
             return added
+        if moved:
+            m = gather_near(ws, near)
         best = _most_promising(waiting, count, scratch.bound)
         point = waiting[best]
         count -= 1
