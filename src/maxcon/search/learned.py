@@ -142,7 +142,7 @@ def learned(
 def _search(task: Task, nets: SearchNetworks, rounds: int | None, settings: Settings) -> Iterator[Step]:
     began = _clock()
     end = began + task.seconds_left()
-    arena = _root(task, nets, settings)
+    arena, walk = _root(task, nets, settings)
     counts, member, limit = arena.integers[:N_COUNTS], arena.flags[: task.problem.n_points], task.limit
     now = spoken = _clock()
     # Of many points, a round takes so long that the clock is looked at between its parts.
@@ -150,8 +150,12 @@ def _search(task: Task, nets: SearchNetworks, rounds: int | None, settings: Sett
     took = [ROUND_ROOTS * (now - began) / len(pieces)] * len(pieces)
     reported = 0
     if len(pieces) > 1:
-        yield _news(counts, member, reported)
-        reported, spoken = int(counts[SIZE]), (now := _clock())
+        if end - now > PAUSE:  # else the step would be the last one
+            yield _news(counts, member, reported)
+            reported, spoken = int(counts[SIZE]), _clock()
+        if walk < end - now + OVERRUN * (now - began):
+            play_parts(arena, limit, settings, WALK_INCUMBENT, WALK_INCUMBENT + 1)
+        now = _clock()
         if end - now > SWAP_FIRST * (now - began):
             finish_search(arena, limit)
             now = _clock()
@@ -180,8 +184,11 @@ def _clock() -> float:
     return time.perf_counter() - compile_seconds()
 
 
-def _root(task: Task, nets: SearchNetworks, settings: Settings) -> Arena:
-    """Return a search that has begun; where there are many points, above searches on fewer of them."""
+def _root(task: Task, nets: SearchNetworks, settings: Settings) -> tuple[Arena, float]:
+    """Return a search that has begun; where there are many points, above searches on fewer of them.
+
+    And the seconds that a walk from its incumbent may take, by what one took on fewer points.
+    """
     N = task.problem.n_points
     sizes = [N]
     least = max(COARSE, COARSE_RANKS * task.rows.At.shape[0])
@@ -197,16 +204,17 @@ def _root(task: Task, nets: SearchNetworks, settings: Settings) -> Arena:
         else:
             afresh = not _agrees(coarse.integers[:N_COUNTS]) and AFRESH * (_clock() - began) < left
             begin_search_above(arena, task.limit, coarse, settings, afresh)
+        if coarse is not None and size < N:
             before = _clock()
-            if walk * COARSER**WALK_GROWTH < left - OVERRUN * (before - began):
+            if walk < left - (1.0 - OVERRUN) * (before - began):
                 play_parts(arena, task.limit, settings, WALK_INCUMBENT, WALK_INCUMBENT + 1)
-                walk = _clock() - before
+                walk = (_clock() - before) * COARSER**WALK_GROWTH
         while size < N and counts[ROUND] < COARSE_ROUNDS and not (counts[ROUND] > 0 and _agrees(counts)):
             if (coarse is not None or counts[ROUND] > 0) and _clock() - began > COARSE_SHARE * left:
                 break
             play_rounds(arena, task.limit, brief, 1)
         coarse = arena
-    return arena
+    return arena, walk
 
 
 def _some(rows: LinearRows, points: NDArray[np.int64]) -> LinearRows:
