@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable
 from pathlib import Path
 
@@ -11,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from maxcon.certification import Certificate, issue, save
 from maxcon.minimax import minimax_fit
-from maxcon.minimax.jit import compile_seconds
+from maxcon.minimax.jit import working_clock
 from maxcon.problem import Consensus, LinearProblem, check_indices, check_model, check_threshold
 from maxcon.problem.validate import check_callback, check_gap, check_time_limit
 from maxcon.search.anytime import Progress, Task, make_task, run
@@ -63,7 +62,7 @@ def certify(
     TypeError, ValueError
         If an argument has the wrong type, shape or range; the message names it.
     """
-    began, compiled = time.perf_counter(), compile_seconds()
+    began = working_clock()
     if not isinstance(problem, LinearProblem):
         raise TypeError(f"problem must be a LinearProblem, but it is a {type(problem).__name__}")
     threshold = check_threshold(threshold)
@@ -80,7 +79,7 @@ def certify(
         return asked or progress.upper_bound - n_given <= gap
 
     best = run(task, prove(task, known), None, stop)
-    seconds = time.perf_counter() - began - (compile_seconds() - compiled)
+    seconds = working_clock() - began
     return judge(task, model, known, best.upper_bound, seconds)
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import inspect
-import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from importlib import import_module
@@ -11,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from maxcon.minimax.jit import compile_seconds
+from maxcon.minimax.jit import working_clock
 from maxcon.problem import Consensus, LinearProblem, check_threshold
 from maxcon.problem.validate import check_callback, check_gap, check_time_limit
 from maxcon.search.anytime import Method, Progress, Refiner, make_task, run
@@ -158,7 +157,7 @@ def fit(
     ValueError
         If an argument is out of its range; the message names it.
     """
-    began, compiled = time.perf_counter(), compile_seconds()
+    began = working_clock()
     if not isinstance(problem, LinearProblem):
         raise TypeError(f"problem must be a LinearProblem, but it is a {type(problem).__name__}")
     threshold = check_threshold(threshold)
@@ -178,7 +177,7 @@ def fit(
     steps = then_prove(task, function, options) if certify and method not in PROVING else function(task, **options)
     best = run(task, steps, refiner, callback)
     result = conclude(task, best, method, seed, 0.0)
-    return replace(result, seconds=time.perf_counter() - began - (compile_seconds() - compiled))
+    return replace(result, seconds=working_clock() - began)
 
 
 def methods() -> dict[str, str]:

@@ -242,11 +242,11 @@ def _run(work: _Work) -> Unit:
     instance = make_instance(work.cell, work.number, settings.seed)
     ours = [name for name in settings.methods if name not in peer_names()]
     unserved = {name: reason for name in ours if (reason := _reason(name, work.cell.family)) is not None}
-    _warm_ours(work.cell, tuple(name for name in ours if name not in unserved), settings.budgets)
+    served = [name for name in ours if name not in unserved]
+    _warm_ours(work.cell, tuple(served), settings.budgets)
     _warm_peers(work.cell.family, settings.methods)
     rows: list[Row] = []
     # The first fits of an instance find cold caches: one is thrown away, and each method has its turn to be the first.
-    served = [name for name in ours if name not in unserved]
     first = work.number % max(len(served), 1)
     served = served[first:] + served[:first]
     if served:

@@ -94,3 +94,8 @@ if not config.DISABLE_JIT:
 def compile_seconds() -> float:
     """Return how long this process has compiled kernels so far; time limits do not count it."""
     return _compilations.so_far()
+
+
+def working_clock() -> float:
+    """Return the time in seconds, from some moment on, without what compiling takes."""
+    return time.perf_counter() - compile_seconds()

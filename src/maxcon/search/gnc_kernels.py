@@ -87,6 +87,14 @@ def local_start(
 
 
 @kernel
+def write_weights(r: NDArray[np.float64], s: float, w: NDArray[np.float64]) -> None:
+    """Write the Geman-McClure weight (s / (r^2 + s))^2 of each residual."""
+    for i in range(r.shape[0]):
+        share = s / (r[i] * r[i] + s)
+        w[i] = share * share
+
+
+@kernel
 def descend(
     At: NDArray[np.float64],
     b: NDArray[np.float64],
@@ -108,10 +116,7 @@ def descend(
     r, w = scratch.r, scratch.w
     compute_residuals(At, b, x, r)
     for _ in range(steps):
-        s = control * limit * limit
-        for i in range(r.shape[0]):
-            share = s / (r[i] * r[i] + s)
-            w[i] = share * share
+        write_weights(r, control * limit * limit, w)
         weighted_model(At, b, w, scratch.weighted, scratch.table, x)
         compute_residuals(At, b, x, r)
         count = count_within(r, limit)

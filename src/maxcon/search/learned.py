@@ -7,9 +7,9 @@ proves it feasible.
 
 from __future__ import annotations
 
-import time
 from collections.abc import Iterator
 from dataclasses import replace
+from itertools import cycle
 from pathlib import Path
 
 import numpy as np
@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from maxcon.agent.search_networks import SearchNetworks, load_search_networks, shipped_search_networks
 from maxcon.minimax import LinearRows
-from maxcon.minimax.jit import compile_seconds
+from maxcon.minimax.jit import working_clock
 from maxcon.search.anytime import Step, Task
 from maxcon.search.belief_proposals import MANY
 from maxcon.search.learned_kernels import (
@@ -58,15 +58,15 @@ PAUSE = 0.002
 
 #: The root of more than `MANY` points is that of a search on `COARSE` random ones, or a `COARSER`-th of the points if
 #: that is more: rounds there until its belief agrees with its incumbent, at most so many, in at most this share of the
-#: time, but one at least.
+#: time, but one at least on the fewest points.
 COARSE, COARSER, COARSE_ROUNDS, COARSE_SHARE = 200, 6, 8, 0.3
+
+#: Where the belief does not agree in the end, the models of all points are made too, if there are so many times as much
+#: time as has been spent.
+AFRESH = 3.0
 
 #: Fewer points than so many times the rank determine too little.
 COARSE_RANKS = 20
-
-#: Where it does not agree in the end, the models of all points are made too, if there are so many times as much time as
-#: has been spent.
-AFRESH = 3.0
 
 #: A walk takes about the number of points to this power. A root's last walk is worth more than all before it: one that
 #: would pass the time limit is begun if it passes it by no more than half of what has been spent.
@@ -140,11 +140,11 @@ def learned(
 
 
 def _search(task: Task, nets: SearchNetworks, rounds: int | None, settings: Settings) -> Iterator[Step]:
-    began = _clock()
+    began = working_clock()
     end = began + task.seconds_left()
     arena, walk = _root(task, nets, settings)
     counts, member, limit = arena.integers[:N_COUNTS], arena.flags[: task.problem.n_points], task.limit
-    now = spoken = _clock()
+    now = spoken = working_clock()
     # Of many points, a round takes so long that the clock is looked at between its parts.
     pieces = [(k, k + 1) for k in range(PARTS)] if task.problem.n_points > MANY else [(0, PARTS)]
     took = [ROUND_ROOTS * (now - began) / len(pieces)] * len(pieces)
@@ -152,36 +152,27 @@ def _search(task: Task, nets: SearchNetworks, rounds: int | None, settings: Sett
     if len(pieces) > 1:
         if end - now > PAUSE:  # else the step would be the last one
             yield _news(counts, member, reported)
-            reported, spoken = int(counts[SIZE]), _clock()
+            reported, spoken = int(counts[SIZE]), working_clock()
         if walk < end - now + OVERRUN * (now - began):
             play_parts(arena, limit, settings, WALK_INCUMBENT, WALK_INCUMBENT + 1)
-        now = _clock()
+        now = working_clock()
         if end - now > SWAP_FIRST * (now - began):
             finish_search(arena, limit)
-            now = _clock()
-    while rounds is None or counts[ROUND] < rounds:
-        for number, (first, last) in enumerate(pieces):
-            if end - now <= PIECE_FITS * took[number]:
-                break
-            play_parts(arena, limit, settings, first, last)
-            done = _clock()
-            took[number], now = max(0.8 * took[number], done - now), done
-            if now - spoken > PAUSE and (len(pieces) > 1 or end - now > 2.0 * took[0]):
-                yield _news(counts, member, reported)
-                reported, spoken = int(counts[SIZE]), (now := _clock())
-        else:
-            if end == np.inf and rounds is None and _is_settled(counts):
-                break
-            continue
-        break
+            now = working_clock()
+    for number in cycle(range(len(pieces))):
+        if number == 0 and (counts[ROUND] >= rounds if rounds is not None else end == np.inf and _is_settled(counts)):
+            break
+        if end - now <= PIECE_FITS * took[number]:
+            break
+        play_parts(arena, limit, settings, *pieces[number])
+        done = working_clock()
+        took[number], now = max(0.8 * took[number], done - now), done
+        if now - spoken > PAUSE and (len(pieces) > 1 or end - now > 2.0 * took[0]):
+            yield _news(counts, member, reported)
+            reported, spoken = int(counts[SIZE]), (now := working_clock())
     if not counts[SWAPPED] and end - now > SWAP_ROUNDS * sum(took):
         finish_search(arena, limit)
     yield _news(counts, member, reported)
-
-
-def _clock() -> float:
-    """Return the time in seconds, from some moment on, without what compiling takes."""
-    return time.perf_counter() - compile_seconds()
 
 
 def _root(task: Task, nets: SearchNetworks, settings: Settings) -> tuple[Arena, float]:
@@ -194,7 +185,7 @@ def _root(task: Task, nets: SearchNetworks, settings: Settings) -> tuple[Arena, 
     least = max(COARSE, COARSE_RANKS * task.rows.At.shape[0])
     while sizes[-1] > max(MANY, 2 * least):
         sizes.append(max(sizes[-1] // COARSER, least))
-    began, left, brief, coarse, walk = _clock(), task.seconds_left(), settings._replace(variations=0), None, 0.0
+    began, left, brief, coarse, walk = working_clock(), task.seconds_left(), settings._replace(variations=0), None, 0.0
     for size in reversed(sizes):
         rows = task.rows if size == N else _some(task.rows, task.rng.choice(N, size, replace=False))
         arena = allocate_arena(rows, seed_state(task.rng), nets.points, nets.peel)
@@ -202,15 +193,14 @@ def _root(task: Task, nets: SearchNetworks, settings: Settings) -> tuple[Arena, 
         if coarse is None:
             begin_search(arena, task.limit)
         else:
-            afresh = not _agrees(coarse.integers[:N_COUNTS]) and AFRESH * (_clock() - began) < left
+            afresh = not _agrees(coarse.integers[:N_COUNTS]) and AFRESH * (working_clock() - began) < left
             begin_search_above(arena, task.limit, coarse, settings, afresh)
-        if coarse is not None and size < N:
-            before = _clock()
-            if walk < left - (1.0 - OVERRUN) * (before - began):
+            before = working_clock()
+            if size < N and walk < left - (1.0 - OVERRUN) * (before - began):
                 play_parts(arena, task.limit, settings, WALK_INCUMBENT, WALK_INCUMBENT + 1)
-                walk = (_clock() - before) * COARSER**WALK_GROWTH
+                walk = (working_clock() - before) * COARSER**WALK_GROWTH
         while size < N and counts[ROUND] < COARSE_ROUNDS and not (counts[ROUND] > 0 and _agrees(counts)):
-            if (coarse is not None or counts[ROUND] > 0) and _clock() - began > COARSE_SHARE * left:
+            if (coarse is not None or counts[ROUND] > 0) and working_clock() - began > COARSE_SHARE * left:
                 break
             play_rounds(arena, task.limit, brief, 1)
         coarse = arena

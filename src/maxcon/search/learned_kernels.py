@@ -17,7 +17,7 @@ from maxcon.minimax.linear import OK, cold_fit, compute_residuals
 from maxcon.problem.validate import check_number
 from maxcon.search.belief import SHRINK, agreement, forget_votes, root_models, start_belief, update_belief
 from maxcon.search.belief_proposals import KEPT, propose, refine_proposals, same_model
-from maxcon.search.gnc_kernels import descend
+from maxcon.search.gnc_kernels import descend, write_weights
 from maxcon.search.learned_memory import (
     AGREEMENT,
     DOUBTS,
@@ -354,23 +354,20 @@ def force_in(search: Search, limit: float, settings: Settings) -> None:
     """Walk from a local minimum near the incumbent that is led through a point outside."""
     ws, scratch, member = search.ws, search.scratch, search.member
     x, r, w = scratch.x, scratch.r, scratch.w
-    N = member.shape[0]
     compute_residuals(ws.At, ws.b, search.x, r)
     size = 0
-    for i in range(N):
+    for i in range(member.shape[0]):
         if not member[i] and abs(r[i]) <= settings.span * limit:
             scratch.inliers[size] = i
             size += 1
     if size == 0:
         return
     point = scratch.inliers[random_below(scratch.state, size)]
-    s = settings.loose * settings.loose * limit * limit
-    for i in range(N):
-        share = s / (r[i] * r[i] + s)
-        w[i] = share * share
+    control = settings.loose * settings.loose
+    write_weights(r, control * limit * limit, w)
     w[point] = settings.pull * search.counts[SIZE]
     weighted_model(ws.At, ws.b, w, scratch.weighted, scratch.table, x)
-    descend(ws.At, ws.b, limit, settings.loose * settings.loose, SHRINK, 1000, scratch, x, scratch.trial, -1)
+    descend(ws.At, ws.b, limit, control, SHRINK, 1000, scratch, x, scratch.trial, -1)
     if _is_new_start(search, limit, x):
         walk_from(search, limit, settings, x, False)
 

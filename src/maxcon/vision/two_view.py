@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -12,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from maxcon.datasets.cameras import epipolar_rows, transformed
 from maxcon.fitting import fit
-from maxcon.minimax.jit import compile_seconds
+from maxcon.minimax.jit import working_clock
 from maxcon.problem import Consensus, check_threshold
 from maxcon.problem.validate import check_time_limit
 from maxcon.search.anytime import Progress
@@ -128,11 +127,10 @@ def find_fundamental(
     threshold = check_threshold(threshold)
     check_time_limit(time_limit)
     first, second = check_matches(x1, x2, LEAST_MATCHES)
-    began, compiled = time.perf_counter(), compile_seconds()
+    began = working_clock()
     posed = fundamental_problem(first, second, chart=chart, threshold=threshold, rng=rng, samples=samples)
     if time_limit is not None:
-        spent = time.perf_counter() - began - (compile_seconds() - compiled)
-        time_limit = max(time_limit - spent, LEAST_TIME)
+        time_limit = max(time_limit - (working_clock() - began), LEAST_TIME)
     consensus = fit(
         posed.problem,
         threshold,
