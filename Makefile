@@ -10,7 +10,7 @@ demo: $(VENV)/.demo-ready
 	$(BIN)/maxcon demo
 
 test: $(VENV)/.dev-ready
-	$(BIN)/python -m pytest
+	$(BIN)/python -m pytest -n 2 --dist loadfile
 
 test-slow: $(VENV)/.dev-ready
 	$(BIN)/python -m pytest -m slow

@@ -57,7 +57,8 @@ from numpy.typing import NDArray  # noqa: E402
 
 from maxcon.agent.search_networks import shipped_search_networks  # noqa: E402
 from maxcon.experiments.search_instances import make_problem  # noqa: E402
-from maxcon.minimax.rows import dot, whiten  # noqa: E402
+from maxcon.minimax.rows import whiten  # noqa: E402
+from maxcon.minimax.sums import dot  # noqa: E402
 from maxcon.problem import LinearProblem  # noqa: E402
 from maxcon.search import learned as method  # noqa: E402
 from maxcon.search.anytime import Task, make_task  # noqa: E402

@@ -11,6 +11,7 @@ from maxcon.search.belief_proposals import (
     KEPT,
     MANY,
     accumulate_weights,
+    draw_lanes,
     draw_weighted,
     keep_best,
     propose,
@@ -18,9 +19,10 @@ from maxcon.search.belief_proposals import (
     same_model,
     sample_model,
 )
+from maxcon.search.lane_kernels import LANES
 from maxcon.search.learned_kernels import begin_search
 from maxcon.search.learned_memory import allocate_arena, carve
-from maxcon.search.random_kernels import seed_state
+from maxcon.search.random_kernels import random_unit, seed_state
 
 
 def begun(A, b, threshold=0.1, seed=0):
@@ -33,14 +35,47 @@ def begun(A, b, threshold=0.1, seed=0):
 
 def test_points_are_drawn_by_their_weight():
     p = np.array([0.0, 1.0, 0.5, 0.25, 0.0])
-    cumulative = np.empty(5)
-    accumulate_weights(p, 2.0, 0.1, cumulative)
+    cumulative, guide = np.empty(5), np.empty(5, dtype=np.int64)
+    accumulate_weights(p, 2.0, 0.1, cumulative, guide)
     weights = p**2 + 0.1
     np.testing.assert_allclose(np.diff(cumulative, prepend=0), weights)
     state = seed_state(np.random.default_rng(0))
-    counts = np.bincount([draw_weighted(cumulative, state) for _ in range(4000)], minlength=5)
+    counts = np.bincount([draw_weighted(cumulative, guide, state) for _ in range(4000)], minlength=5)
     expected = 4000 * weights / weights.sum()
     assert (np.abs(counts - expected) < 5 * np.sqrt(expected)).all()
+
+
+@pytest.mark.parametrize("name", ["even", "one", "none but the last", "tiny", "steep"])
+def test_the_guide_leads_to_the_point_of_the_running_sums(name):
+    rng = np.random.default_rng(1)
+    p = {
+        "even": np.ones(50),
+        "one": np.eye(50)[17],
+        "none but the last": np.eye(50)[49],
+        "tiny": 1e-9 * rng.random(50),
+        "steep": 10.0 ** -rng.uniform(0, 30, 50),
+    }[name]
+    cumulative, guide = np.empty(50), np.empty(50, dtype=np.int64)
+    accumulate_weights(p, 1.0, 1e-300, cumulative, guide)
+    state = seed_state(rng)
+    for _ in range(500):
+        before = state.copy()
+        point = draw_weighted(cumulative, guide, state)
+        target = random_unit(before) * cumulative[-1]
+        assert point == min(np.searchsorted(cumulative, target, side="right"), 49)
+
+
+def test_the_points_of_a_sample_are_different_where_they_can_be():
+    p = np.array([1.0, 1.0, 1.0, 0.01, 0.01])
+    cumulative, guide = np.empty(5), np.empty(5, dtype=np.int64)
+    accumulate_weights(p, 1.0, 0.0, cumulative, guide)
+    points = np.zeros((3, LANES), dtype=np.int64)
+    state = seed_state(np.random.default_rng(0))
+    draw_lanes(cumulative, guide, state, LANES, points)
+    assert all(len(set(lane)) == 3 for lane in points.T)
+    accumulate_weights(np.eye(5)[2], 1.0, 0.0, cumulative, guide)
+    draw_lanes(cumulative, guide, state, 7, points)
+    assert (points[:, :7] == 2).all()  # which `solve_lanes` finds dependent
 
 
 @pytest.mark.parametrize("d", [1, 2, 8])
@@ -49,9 +84,10 @@ def test_a_model_passes_through_believed_points(d):
     search, task = begun(rng.normal(size=(30, d)), rng.normal(size=30))
     believed = np.arange(30) < d + 2
     scratch, x = search.scratch, np.zeros(d)
+    cumulative, guide = np.empty(30), np.empty(30, dtype=np.int64)
+    accumulate_weights(np.where(believed, 1.0, 1e-12), 1.0, 0.0, cumulative, guide)
     for _ in range(20):
-        cumulative = np.cumsum(np.where(believed, 1.0, 1e-12))
-        sample_model(task.rows.At, task.rows.b, cumulative, scratch.state, scratch.table, scratch.places, x)
+        sample_model(task.rows.At, task.rows.b, cumulative, guide, scratch.state, scratch.table, scratch.places, x)
         r = np.abs(task.rows.b - task.rows.At.T @ x)
         assert np.count_nonzero(r[believed] < 1e-9) >= d
         assert np.count_nonzero(r[~believed] < 1e-9) == 0
@@ -62,8 +98,10 @@ def test_degenerate_data_make_finite_models(name):
     rng = np.random.default_rng(4)
     search, task = begun(*BUILDERS[name](rng, 12, 3))
     scratch, x = search.scratch, np.zeros(task.rows.At.shape[0])
+    cumulative, guide = np.empty(12), np.empty(12, dtype=np.int64)
+    accumulate_weights(np.ones(12), 1.0, 0.0, cumulative, guide)
     for _ in range(50):
-        sample_model(task.rows.At, task.rows.b, np.arange(1.0, 13.0), scratch.state, scratch.table, scratch.places, x)
+        sample_model(task.rows.At, task.rows.b, cumulative, guide, scratch.state, scratch.table, scratch.places, x)
         assert np.isfinite(x).all()
 
 

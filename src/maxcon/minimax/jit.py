@@ -48,7 +48,21 @@ def kernel(function: F) -> F:
     The cache lies beside the source, or, where that folder is read-only, in the user's cache folder
     (numba chooses). With ``NUMBA_DISABLE_JIT=1`` the function is returned as it is.
     """
-    dispatcher = numba.njit(cache=True, nogil=True, error_model="numpy")(function)
+    return _compiled(function, False)
+
+
+def sum_kernel(function: F) -> F:
+    """Compile `function`, which does nothing but sum, as `kernel` does, but let the compiler reorder its additions.
+
+    In order, one addition waits for the one before. Reordered they fill a vector register, three times as fast (LLVM's
+    "reassoc", without the other liberties of "fastmath": infinities and NaNs stay what they are). The last bits then
+    hang on the width of the machine's registers.
+    """
+    return _compiled(function, {"reassoc"})
+
+
+def _compiled(function: F, liberties: bool | set[str]) -> F:
+    dispatcher = numba.njit(cache=True, nogil=True, error_model="numpy", fastmath=liberties)(function)
     cache_file = getattr(getattr(dispatcher, "_cache", None), "_cache_file", None)
     if cache_file is not None and function.__module__.startswith("maxcon."):
         cache_file._source_stamp = _digest(function.__module__.removeprefix("maxcon."))
@@ -67,8 +81,8 @@ class _FirstCompilation(event.Listener):  # type: ignore[misc]
     def on_start(self, event: Any) -> None:
         self._began.append(time.perf_counter())
         dispatcher = event.data.get("dispatcher")
-        module = getattr(getattr(dispatcher, "py_func", None), "__module__", "")
-        if not self.said and module.startswith("maxcon."):
+        module = getattr(getattr(dispatcher, "py_func", None), "__module__", None)  # None: of a user's own `exec`
+        if not self.said and str(module).startswith("maxcon."):
             self.said = True
             print(
                 "maxcon: compiling its kernels for this machine (once; they are kept on disk) ...",

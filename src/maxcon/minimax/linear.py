@@ -58,21 +58,11 @@ def _subtract_product(At: NDArray[np.float64], x: NDArray[np.float64], r: NDArra
         for i in range(N):
             r[i] -= (a0[i] * x0 + a1[i] * x1) + (a2[i] * x2 + a3[i] * x3)
         j += 4
-    if j + 2 < d:
-        x0, x1, x2 = x[j], x[j + 1], x[j + 2]
-        a0, a1, a2 = At[j], At[j + 1], At[j + 2]
-        for i in range(N):
-            r[i] -= a0[i] * x0 + a1[i] * x1 + a2[i] * x2
-    elif j + 1 < d:
-        x0, x1 = x[j], x[j + 1]
-        a0, a1 = At[j], At[j + 1]
-        for i in range(N):
-            r[i] -= a0[i] * x0 + a1[i] * x1
-    elif j < d:
-        x0 = x[j]
-        a0 = At[j]
+    while j < d:
+        x0, a0 = x[j], At[j]
         for i in range(N):
             r[i] -= a0[i] * x0
+        j += 1
 
 
 @kernel

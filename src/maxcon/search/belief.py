@@ -17,6 +17,7 @@ from maxcon.agent.perceptron import Perceptron, evaluate_columns
 from maxcon.agent.point_features import write_root_features, write_round_features
 from maxcon.minimax.jit import kernel
 from maxcon.minimax.linear import compute_residuals
+from maxcon.minimax.sums import total_of
 from maxcon.search.gnc_kernels import descend, global_start, least_absolute_model
 from maxcon.search.sampling_kernels import Scratch
 
@@ -110,24 +111,11 @@ def nearness(r: NDArray[np.float64], limit: float, near: NDArray[np.float64]) ->
 
     `near` may be r itself.
     """
-    N = r.shape[0]
     scale = 1.0 / (REACH * limit * REACH * limit)
-    for i in range(N):
-        near[i] = max(1.0 - r[i] * r[i] * scale, 0.0)
-    s0 = s1 = s2 = s3 = s4 = s5 = s6 = s7 = 0.0  # eight lanes: a single sum may not be reordered
-    whole = N - N % 8
-    for i in range(0, whole, 8):
-        s0 += near[i]
-        s1 += near[i + 1]
-        s2 += near[i + 2]
-        s3 += near[i + 3]
-        s4 += near[i + 4]
-        s5 += near[i + 5]
-        s6 += near[i + 6]
-        s7 += near[i + 7]
-    for i in range(whole, N):
-        s0 += near[i]
-    return ((s0 + s4) + (s1 + s5)) + ((s2 + s6) + (s3 + s7))
+    for i in range(r.shape[0]):
+        value = 1.0 - r[i] * r[i] * scale
+        near[i] = value if value > 0.0 else 0.0
+    return total_of(near[: r.shape[0]])
 
 
 @kernel

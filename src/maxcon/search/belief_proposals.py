@@ -11,6 +11,7 @@ from maxcon.minimax.jit import kernel
 from maxcon.minimax.linear import compute_residuals
 from maxcon.search.belief import RAW, SHARP, SHRINK, SOFT, Belief, cast_vote, nearness
 from maxcon.search.gnc_kernels import descend, local_start
+from maxcon.search.lane_kernels import LANES, Lanes, solve_lanes
 from maxcon.search.model_kernels import count_within, eliminate_point, substitute_back
 from maxcon.search.random_kernels import draw_next, random_unit
 from maxcon.search.sampling_kernels import Scratch
@@ -33,8 +34,10 @@ class Proposals(NamedTuple):
     ----------
     models, scores
         Shapes (KEPT, r) and (KEPT,): best first; scores are soft counts of points.
-    cumulative
-        Shape (N,): running sums of the weights of the draw.
+    cumulative, guide
+        Shape (N,): running sums of the weights of the draw, and where to begin to look among them.
+    lanes
+        Samples side by side.
     few_rows, few_b, few_r
         Shapes (r, m), (m,), (m,): the random points that samples are ranked on, m = 0 where all are.
     best
@@ -44,6 +47,8 @@ class Proposals(NamedTuple):
     models: NDArray[np.float64]
     scores: NDArray[np.float64]
     cumulative: NDArray[np.float64]
+    guide: NDArray[np.int64]
+    lanes: Lanes
     few_rows: NDArray[np.float64]
     few_b: NDArray[np.float64]
     few_r: NDArray[np.float64]
@@ -51,27 +56,67 @@ class Proposals(NamedTuple):
 
 
 @kernel
-def accumulate_weights(p: NDArray[np.float64], power: float, floor: float, cumulative: NDArray[np.float64]) -> None:
-    """Write the running sums of the weights of the draw, p^power + floor."""
+def accumulate_weights(
+    p: NDArray[np.float64],
+    power: float,
+    floor: float,
+    cumulative: NDArray[np.float64],
+    guide: NDArray[np.int64],
+) -> None:
+    """Write the running sums of the weights of the draw, p^power + floor, and their guide.
+
+    ``guide[k]`` is the first point whose running sum is above k / N of all: a draw begins to look there, and is a step
+    or two from its point (guide table, Chen and Asau 1974).
+    """
+    N = p.shape[0]
     total = 0.0
-    for i in range(p.shape[0]):
+    for i in range(N):
         total += p[i] ** power + floor
         cumulative[i] = total
+    point = 0
+    for k in range(N):
+        while point < N - 1 and cumulative[point] <= k * total / N:
+            point += 1
+        guide[k] = point
 
 
 @kernel
-def draw_weighted(cumulative: NDArray[np.float64], state: NDArray[np.int64]) -> int:
-    """Draw a point with the probability of its share of the running sums (bisection)."""
+def draw_weighted(cumulative: NDArray[np.float64], guide: NDArray[np.int64], state: NDArray[np.int64]) -> int:
+    """Draw a point with the probability of its share of the running sums."""
     last = cumulative.shape[0] - 1
-    target = random_unit(state) * cumulative[last]
-    low, high = 0, last
-    while low < high:
-        middle = (low + high) >> 1
-        if cumulative[middle] > target:
-            high = middle
-        else:
-            low = middle + 1
-    return low
+    share = random_unit(state)
+    target, point = share * cumulative[last], guide[int(share * (last + 1))]
+    while point < last and cumulative[point] <= target:
+        point += 1
+    return int(point)
+
+
+@kernel
+def draw_lanes(
+    cumulative: NDArray[np.float64],
+    guide: NDArray[np.int64],
+    state: NDArray[np.int64],
+    count: int,
+    points: NDArray[np.int64],
+) -> None:
+    """Draw the points of the first `count` lanes, shape (r, LANES), by weight.
+
+    All points of a lane are different, unless that takes too many draws.
+    """
+    d = points.shape[0]
+    for lane in range(count):
+        k = 0
+        for _ in range(4 * d + 16):
+            if k == d:
+                break
+            points[k, lane] = draw_weighted(cumulative, guide, state)
+            known = False
+            for other in range(k):
+                known = known or points[other, lane] == points[k, lane]
+            if not known:
+                k += 1
+        for other in range(k, d):
+            points[other, lane] = points[0, lane]
 
 
 @kernel
@@ -79,6 +124,7 @@ def sample_model(
     At: NDArray[np.float64],
     b: NDArray[np.float64],
     cumulative: NDArray[np.float64],
+    guide: NDArray[np.int64],
     state: NDArray[np.int64],
     table: NDArray[np.float64],
     places: NDArray[np.int64],
@@ -86,7 +132,7 @@ def sample_model(
 ) -> None:
     """Write into x the model through r independent points drawn by weight, as `minimal_model` does uniformly.
 
-    A point drawn again depends on itself, and is passed over like any other that depends on those before it.
+    A point that depends on those before it, as one that is drawn again does, is passed over.
     """
     d = At.shape[0]
     for j in range(d):
@@ -95,7 +141,7 @@ def sample_model(
     for _ in range(4 * d + 16):
         if rank == d:
             break
-        if eliminate_point(At, b, draw_weighted(cumulative, state), rank, table, places):
+        if eliminate_point(At, b, draw_weighted(cumulative, guide, state), rank, table, places):
             rank += 1
     substitute_back(rank, table, places, x)
 
@@ -150,16 +196,25 @@ def propose(
     x, r = scratch.x, scratch.r
     state, table, places = scratch.state, scratch.table, scratch.places
     votes, totals, tops = belief.votes, belief.totals, belief.tops
-    models, scores, cumulative = proposals.models, proposals.scores, proposals.cumulative
-    few_rows, few_b, few_r = proposals.few_rows, proposals.few_b, proposals.few_r
+    models, scores, cumulative, guide = proposals.models, proposals.scores, proposals.cumulative, proposals.guide
+    few_rows, few_b, few_r, lanes = proposals.few_rows, proposals.few_b, proposals.few_r, proposals.lanes
     few = few_b.shape[0] > 0
-    accumulate_weights(belief.p, power, floor, cumulative)
+    accumulate_weights(belief.p, power, floor, cumulative, guide)
     for k in range(KEPT):
         scores[k] = -1.0
     if few:
         _choose_few(At, b, few_rows, few_b, scratch.pool, state)
-    for _ in range(samples):
-        sample_model(At, b, cumulative, state, table, places, x)
+    for number in range(samples):
+        lane = number % LANES
+        if lane == 0:
+            count = min(LANES, samples - number)
+            draw_lanes(cumulative, guide, state, count, lanes.points)
+            solve_lanes(At, b, count, lanes)
+        if lanes.good[lane]:
+            for j in range(x.shape[0]):
+                x[j] = lanes.models[j, lane]
+        else:
+            sample_model(At, b, cumulative, guide, state, table, places, x)
         if few:
             compute_residuals(few_rows, few_b, x, few_r)
             keep_best(models, scores, x, nearness(few_r, limit, few_r))

@@ -37,7 +37,7 @@ from maxcon.search.learned_memory import (
 from maxcon.search.model_kernels import count_within, least_squares_model, weighted_model
 from maxcon.search.peel_walk import choose_start, install_walk, walk_down
 from maxcon.search.random_kernels import draw_next, random_below, random_unit
-from maxcon.search.refine_kernels import refine_kernel, swap_kernel
+from maxcon.search.refine_kernels import refine_by, swap_kernel
 from maxcon.search.vertex_kernels import load_vertex, save_vertex
 
 #: The parts of a round, in order; walks 0 and 1 start from proposals, 2 from the incumbent, the rest from variations.
@@ -283,7 +283,7 @@ def walk_from(search: Search, limit: float, settings: Settings, x: NDArray[np.fl
         return
     for i in range(N):
         search.refinement.tried[i] = False
-    size = m - removed + refine_kernel(ws, limit, search.refinement)
+    size = m - removed + refine_by(ws, limit, search.refinement, counts[SIZE] - (m - removed) + 1)
     if size > counts[SIZE]:
         take_vertex(search, limit, size)
 

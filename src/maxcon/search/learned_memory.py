@@ -18,6 +18,7 @@ from maxcon.minimax import LinearRows, Workspace
 from maxcon.minimax.jit import kernel
 from maxcon.search.belief import Belief
 from maxcon.search.belief_proposals import FEW, KEPT, MANY, Proposals
+from maxcon.search.lane_kernels import LANES, Lanes
 from maxcon.search.peel_walk import Walk
 from maxcon.search.refine_kernels import RefineScratch
 from maxcon.search.sampling_kernels import Scratch
@@ -120,18 +121,18 @@ def allocate_arena(
         + 6 * wide
         + n * n * 6 + n * 8 + 2 * n * (n + 2)  # vertices and tables
         + d * (d + 1) + 6 * d + KEPT * (d + 1) + MEMORY * d  # models
-        + 6 + few * (d + 2)
+        + 6 + few * (d + 2) + d * (d + 2) * LANES
         + 2 * BLOCK * int(point_net.widths.max()) + 2 * int(peel_net.widths.max())
         + n * N_PEEL_FEATURES * (1 + log_steps)
     )  # fmt: skip
-    integers = N_COUNTS + (9 + 2 * n) * N + 9 * n + d + BINS + log_steps * n
+    integers = N_COUNTS + (10 + 2 * n) * N + 9 * n + d + BINS + log_steps * n + d * LANES
     return Arena(
         rows.At,
         rows.b,
         state,
         np.zeros(floats),
         np.zeros(integers, dtype=np.int64),
-        np.zeros(5 * N, dtype=np.bool_),
+        np.zeros(5 * N + LANES, dtype=np.bool_),
         point_net,
         peel_net,
         log_steps,
@@ -233,11 +234,17 @@ def carve(arena: Arena) -> Search:
     models, f = _cut2(F, f, KEPT, d)
     scores, f = _cut(F, f, KEPT)
     cumulative, f = _cut(F, f, N)
+    guide, k = _cut(K, k, N)
+    lane_points, k = _cut2(K, k, d, LANES)
+    lane_table, f = _cut3(F, f, d, d + 1, LANES)
+    lane_models, f = _cut2(F, f, d, LANES)
+    good, g = _cut(B, g, LANES)
+    lanes = Lanes(lane_points, lane_table, lane_models, good)
     few_rows, f = _cut2(F, f, d, few)
     few_b, f = _cut(F, f, few)
     few_r, f = _cut(F, f, few)
     best, f = _cut(F, f, d)
-    proposals = Proposals(models, scores, cumulative, few_rows, few_b, few_r, best)
+    proposals = Proposals(models, scores, cumulative, guide, lanes, few_rows, few_b, few_r, best)
 
     points, k = _cut(K, k, N)
     walk_At, f = _cut(F, f, d * N)

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from maxcon.minimax.jit import kernel
 from maxcon.minimax.linear import compute_residuals
-from maxcon.minimax.rows import dot
+from maxcon.minimax.sums import dot
 from maxcon.search.random_kernels import draw_next
 
 #: A row counts as dependent on those before it where elimination leaves less than this of its largest

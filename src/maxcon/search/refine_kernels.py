@@ -317,11 +317,11 @@ def refine_kernel(ws: Workspace, limit: float, scratch: RefineScratch) -> int:
     -----
     A point whose fit fails for rounding is left out, which is always sound.
     """
-    return _refine(ws, limit, scratch, 1)
+    return refine_by(ws, limit, scratch, 1)
 
 
 @kernel
-def _refine(ws: Workspace, limit: float, scratch: RefineScratch, least: int) -> int:
+def refine_by(ws: Workspace, limit: float, scratch: RefineScratch, least: int) -> int:
     """Do what `refine_kernel` does, but give up as soon as fewer than `least` points can be added in all."""
     n = ws.x.shape[0]
     waiting, near, certificate = scratch.waiting, scratch.near, scratch.certificate
@@ -392,7 +392,7 @@ def swap_kernel(ws: Workspace, limit: float, scratch: RefineScratch) -> int:
         _choose_substitutes(ws, scratch, point)
         more = 0
         if remove_point(ws, point) == OK and ws.x[ws.x.shape[0] - 1] <= limit:
-            more = _refine(ws, limit, scratch, 2) - 1
+            more = refine_by(ws, limit, scratch, 2) - 1
         changed = more > 0
         if changed:
             gained += more
