@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from maxcon.minimax.jit import kernel
-from maxcon.minimax.sums import dot
+from maxcon.minimax.sums import dot, largest_size
 from maxcon.problem import LinearProblem
 
 #: A column whose part orthogonal to the others is smaller than this, relative to its length, has no rank:
@@ -99,29 +99,29 @@ def _whiten(
     """
     N, d = A.shape
     R, inverse, lengths, order = scratch[0], scratch[1], scratch[2, 0], scratch[2, 1]
+    for j in range(d):
+        column = W[j]
+        for i in range(N):
+            column[i] = A[i, j]
     constant = -1  # an intercept
     for j in range(d):
-        same = A[0, j] != 0.0
-        for i in range(1, N):
-            same = same and A[i, j] == A[0, j]
-        if same:
+        if W[j, 0] != 0.0 and _is_constant(W[j]):
             constant = j
     for j in range(d):
         # Beside an intercept, columns may be shifted; years and time stamps then lose nothing to their offset.
-        shift = A[0, j] if constant >= 0 and j != constant else 0.0
+        column, shift = W[j], W[j, 0] if constant >= 0 and j != constant else 0.0
         shifts[j] = shift
-        largest = 0.0
         for i in range(N):
-            largest = max(largest, abs(A[i, j] - shift))
+            column[i] -= shift
+        largest = largest_size(column)
         unit = 1.0  # a power of two: scaling by it is exact
         if largest > 0.0:
-            unit = 2.0 ** float(np.round(np.log2(largest)))
-        for i in range(N):
-            W[j, i] = (A[i, j] - shift) / unit
-        length = np.sqrt(dot(W[j], W[j]))
-        lengths[j] = (length if length > 0.0 else 1.0) * unit
-        for i in range(N):
-            W[j, i] = (A[i, j] - shift) / lengths[j]
+            unit = 2.0 ** min(max(float(np.round(np.log2(largest))), -1000.0), 1000.0)  # 1 / unit must be finite
+        _scale(column, 1.0 / unit)
+        length = np.sqrt(dot(column, column))
+        length = length if length > 0.0 else 1.0
+        _scale(column, 1.0 / length)
+        lengths[j] = length * unit
         order[j] = j
         for k in range(d):
             R[j, k] = 0.0
@@ -149,8 +149,7 @@ def _whiten(
             rank = k
             break
         R[k, k] = size
-        for i in range(N):
-            W[k, i] /= size
+        _scale(W[k], 1.0 / size)
         for j in range(k + 1, d):
             along = dot(W[k], W[j])
             R[k, j] = along
@@ -173,17 +172,15 @@ def _whiten(
             to_model[column, k] = inverse[j, k] * root / lengths[column]
     for k in range(rank):
         along = dot(W[k], b)
-        for i in range(N):
-            W[k, i] *= root
+        _scale(W[k], root)
         for j in range(d):
             origin[j] += to_model[j, k] * along / root
-    largest = 0.0
     for i in range(N):
         total = b[i]
         for j in range(d):
             total -= (A[i, j] - shifts[j]) * origin[j]
         rest[i] = total
-        largest = max(largest, abs(total))
+    largest = largest_size(rest)
     if constant >= 0:  # from shifted columns to those of A
         for j in range(d):
             part = shifts[j] / A[0, constant]
@@ -191,6 +188,22 @@ def _whiten(
             for k in range(rank):
                 to_model[constant, k] -= part * to_model[j, k]
     return rank, largest
+
+
+@kernel
+def _is_constant(x: NDArray[np.float64]) -> bool:
+    same = True
+    for i in range(1, x.shape[0]):
+        same = same and x[i] == x[0]
+        if not same:
+            break
+    return same
+
+
+@kernel
+def _scale(x: NDArray[np.float64], factor: float) -> None:
+    for i in range(x.shape[0]):
+        x[i] *= factor
 
 
 @kernel

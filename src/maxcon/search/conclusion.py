@@ -21,22 +21,21 @@ def conclude(task: Task, best: Best, method: str, seed: int | None, seconds: flo
     subset = best.subset if best.subset is not None and best.subset.any() else any_feasible_set(task)
     if subset is None:
         return _infeasible(problem, task.threshold, method, seed, seconds)
-    fit = minimax_fit(problem, subset)
-    mask = problem.residuals(fit.model) <= limit
-    while mask.sum() > subset.sum():
-        subset = mask
+    size = 0
+    while (n_inliers := int(np.count_nonzero(subset))) > size:
+        size = n_inliers
         fit = minimax_fit(problem, subset)
-        mask = problem.residuals(fit.model) <= limit
-    n_inliers = int(mask.sum())
+        residuals = problem.residuals(fit.model)
+        subset = residuals <= limit
     upper_bound, status = _standing(task, n_inliers, best.upper_bound)
     return Consensus(
         model=fit.model,
-        inlier_mask=mask,
+        inlier_mask=subset,
         n_inliers=n_inliers,
         upper_bound=upper_bound,
         gap=upper_bound - n_inliers,
         status=status,
-        residuals=problem.residuals(fit.model),
+        residuals=residuals,
         basis=fit.basis,
         path=best.path,
         threshold=task.threshold,

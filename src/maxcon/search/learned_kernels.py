@@ -107,6 +107,7 @@ class Settings(NamedTuple):
     loose: float = 2.0
     pull: float = 1.0
     lost: int = 2
+    tries: int = 4
 
 
 #: The least and the largest value of each setting.
@@ -129,6 +130,7 @@ _RANGES = {
     "loose": (1.0, 1e6),
     "pull": (0.0, 1e6),
     "lost": (0, 100),
+    "tries": (1, 2**31 - 1),
 }
 
 
@@ -283,7 +285,7 @@ def walk_from(search: Search, limit: float, settings: Settings, x: NDArray[np.fl
         return
     for i in range(N):
         search.refinement.tried[i] = False
-    size = m - removed + refine_by(ws, limit, search.refinement, counts[SIZE] - (m - removed) + 1)
+    size = m - removed + refine_by(ws, limit, search.refinement, counts[SIZE] - (m - removed) + 1, settings.tries)
     if size > counts[SIZE]:
         take_vertex(search, limit, size)
 

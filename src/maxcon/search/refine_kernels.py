@@ -317,21 +317,25 @@ def refine_kernel(ws: Workspace, limit: float, scratch: RefineScratch) -> int:
     -----
     A point whose fit fails for rounding is left out, which is always sound.
     """
-    return refine_by(ws, limit, scratch, 1)
+    return refine_by(ws, limit, scratch, 1, ws.r.shape[0])
 
 
 @kernel
-def refine_by(ws: Workspace, limit: float, scratch: RefineScratch, least: int) -> int:
-    """Do what `refine_kernel` does, but give up as soon as fewer than `least` points can be added in all."""
+def refine_by(ws: Workspace, limit: float, scratch: RefineScratch, least: int, tries: int) -> int:
+    """Do what `refine_kernel` does, but give up as soon as fewer than `least` points can be added in all.
+
+    And, while more than one of these is missing, after `tries` points in a row that could not be added.
+    """
     n = ws.x.shape[0]
     waiting, near, certificate = scratch.waiting, scratch.near, scratch.certificate
     added = _add_witnessed(ws, limit, scratch)
     moved = True
-    count = m = 0
+    count = m = failed = 0
     while True:
         if moved:
             count = _list_waiting(ws, limit, scratch)
-        if count < max(least - added, 1):
+            failed = 0
+        if count < max(least - added, 1) or (failed >= tries and least - added > 1):
             return added
         if moved:
             m = gather_near(ws, near)
@@ -343,12 +347,14 @@ def refine_by(ws: Workspace, limit: float, scratch: RefineScratch, least: int) -
         if m > 0 and near_forbid(ws, limit, near, m, point):
             _write_certificate(near.C, near.q, -1, point, certificate)
             moved = False
+            failed += 1
             continue
         save_vertex(ws, scratch.copies, 0)
         moved = add_point(ws, point, limit) == OK and ws.x[n - 1] <= limit
         if moved:
             added += 1 + _add_witnessed(ws, limit, scratch)
         else:
+            failed += 1
             _write_certificate(ws.C, ws.q, -1, point, certificate)
             ws.gain[point] = 0.0
             ws.cap[point] = np.inf
@@ -392,7 +398,7 @@ def swap_kernel(ws: Workspace, limit: float, scratch: RefineScratch) -> int:
         _choose_substitutes(ws, scratch, point)
         more = 0
         if remove_point(ws, point) == OK and ws.x[ws.x.shape[0] - 1] <= limit:
-            more = refine_by(ws, limit, scratch, 2) - 1
+            more = refine_by(ws, limit, scratch, 2, N) - 1
         changed = more > 0
         if changed:
             gained += more
