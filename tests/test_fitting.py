@@ -1,15 +1,19 @@
 """The front door: its arguments, its result, and the loop behind it."""
 
 import dataclasses
+import threading
 import time
 
 import numpy as np
 import pytest
+from numba import config
+from numba.core import event
 
 import maxcon
 import maxcon.fitting
 from instances import FAMILIES
 from maxcon.datasets.synthetic import synthetic_hyperplane
+from maxcon.minimax.jit import compile_seconds, working_clock
 from maxcon.search.anytime import Progress, Step, make_task, run
 from maxcon.search.conclusion import conclude
 from oracles import default_slack, highs_minimax
@@ -242,3 +246,51 @@ def test_compiling_does_not_count_against_the_time_limit(problem, monkeypatch):
         raise AssertionError("the time is over")
 
     assert run(task, steps()).upper_bound == 50
+
+
+@pytest.mark.skipif(config.DISABLE_JIT, reason="no kernel is compiled")
+def test_loading_kernels_does_not_count_either():
+    """Numba holds its lock while it compiles and while it loads a kernel from disk."""
+    clock, began, before = working_clock(), time.perf_counter(), compile_seconds()
+    with event.trigger_event("numba:compiler_lock"):
+        with event.trigger_event("numba:compiler_lock"):  # a kernel that another one calls
+            time.sleep(0.05)
+        time.sleep(0.05)
+    taken = compile_seconds() - before
+    assert 0.1 <= taken <= time.perf_counter() - began
+    assert working_clock() - clock <= time.perf_counter() - began - taken + 1e-3
+
+
+@pytest.mark.skipif(config.DISABLE_JIT, reason="no kernel is compiled")
+def test_kernels_that_other_threads_load():
+    before = compile_seconds()
+    inside, done = threading.Barrier(3), threading.Event()
+
+    def load():
+        with event.trigger_event("numba:compiler_lock"):
+            inside.wait(10)
+            done.wait(10)
+
+    threads = [threading.Thread(target=load) for _ in range(2)]
+    for thread in threads:
+        thread.start()
+    inside.wait(10)
+    time.sleep(0.05)
+    assert 0.05 <= compile_seconds() - before < 10  # one is at it, one waits: counted once
+    done.set()
+    for thread in threads:
+        thread.join()
+    known = compile_seconds()
+    time.sleep(0.02)
+    assert compile_seconds() == known
+
+
+@pytest.mark.skipif(config.DISABLE_JIT, reason="no kernel is compiled")
+def test_ctrl_c_while_a_kernel_is_waited_for_does_not_stop_the_clock():
+    """Numba notes the start before it has its lock; interrupted there, it notes no end."""
+    before = compile_seconds()
+    event.start_event("numba:compiler_lock")
+    clock = working_clock()
+    time.sleep(0.05)
+    assert working_clock() - clock >= 0.05
+    assert compile_seconds() == before

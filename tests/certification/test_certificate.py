@@ -135,3 +135,10 @@ def test_the_digest_is_of_the_numbers_and_their_order():
     nudged[3] = np.nextafter(nudged[3], 1)
     for other in (data_digest(swapped, b), data_digest(A, nudged), data_digest(A.reshape(15, 2), b)):
         assert other != digest
+
+
+def test_a_folder_that_is_not_there(tmp_path):
+    problem = maxcon.line(np.arange(5.0), np.arange(5.0))
+    with pytest.raises(FileNotFoundError, match="there is no such folder") as caught:
+        maxcon.write_certificate(tmp_path / "none" / "c.json", maxcon.fit(problem, 0.1))
+    assert caught.value.filename == str(tmp_path / "none")

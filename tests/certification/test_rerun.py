@@ -89,3 +89,13 @@ def test_a_rerun_confirms_or_refutes_a_claim():
     report = verify(wrong, problem.A, problem.b, rerun=True)
     assert not report.accepted
     assert f"some model has {report.rerun.n_inliers} inliers" in report.reason
+
+
+def test_what_a_solver_raises_reaches_the_caller(monkeypatch):
+    def solver(*_args, **_options):
+        raise ZeroDivisionError
+
+    monkeypatch.setattr("scipy.optimize.milp", solver)
+    A, b = synthetic(np.random.default_rng(0), 30, 3, 0.2)[:2]
+    with pytest.raises(ZeroDivisionError):
+        again(A, b, 0.1, 25)

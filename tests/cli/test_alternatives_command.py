@@ -1,4 +1,5 @@
 import json
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -92,13 +93,19 @@ def test_errors(fails, points, args, message):
     assert message in fails("alternatives", points, "--model", "line", *args)
 
 
-def test_without_a_proof(fails, points, monkeypatch):
+def test_without_a_proof(run, points, monkeypatch):
     def slow(_task):
         yield Step(subset=np.isin(np.arange(40), [1, 2]))
 
     monkeypatch.setattr("maxcon.search.alternatives.exact", slow)
-    message = fails("alternatives", points, "--model", "line", "--threshold", 0.06)
-    assert "the largest consensus is not proven: 32 found, 40 possible" in message
+    result = run("alternatives", points, "--model", "line", "--threshold", 0.06, "--json", "all.json")
+    assert result.exit_code == 0, result.output
+    assert "32 of 40 (80.0%), not proven to be the largest: at most 40 are possible" in result.stdout
+    assert "sets       not looked for" in result.stdout
+    assert "unknown    40 points: not settled in time" in result.stdout
+    record = json.loads(Path("all.json").read_text(encoding="utf-8"))
+    assert (record["n_inliers"], record["upper_bound"]) == (32, 40)
+    assert (record["proven"], record["complete"]) == (False, False)
 
 
 def test_rows():

@@ -28,11 +28,17 @@ def test_a_run_and_its_page(run, tmp_path):
     assert (tmp_path / "res" / "records.jsonl").read_bytes() == records  # nothing was run twice
 
 
-def test_absent_peers_are_named(run):
-    result = run("bench", *TINY, *OURS)
+def test_absent_peers_are_named_where_all_are_meant(run, monkeypatch):
+    absent = absent_peers() or {"peer-of-a-test": "peer"}
+    monkeypatch.setattr("maxcon.experiments.bench.absent_peers", lambda: absent)
+    monkeypatch.setattr("maxcon.experiments.bench.usual_methods", lambda: ("auto", "gnc"))
+    result = run("bench", *TINY)
     assert result.exit_code == 0
-    for name in absent_peers():
+    for name in absent:
         assert f"{name} is not installed and left out" in result.stderr
+    result = run("bench", *TINY, *OURS, "--out", "other")
+    assert result.exit_code == 0
+    assert "not installed" not in result.stderr
 
 
 def test_quick_is_a_start(run, tmp_path):

@@ -216,3 +216,36 @@ def test_plain_knows_no_nan():
     value = {"a": np.array([1.0, np.nan]), "b": (np.float64(np.inf), np.int64(3), np.bool_(True)), "c": None}
     assert plain(value) == {"a": [1.0, None], "b": [None, 3, True], "c": None}
     json.dumps(plain(value), allow_nan=False)
+
+
+def test_a_note_where_the_consensus_says_nothing(run, points):
+    note = "so few inliers say nothing: 2 points nearly always have a model through them"
+    assert note in run("fit", points, "--model", "line", "--threshold", 1e-9).stdout
+    assert "\nnote " not in run("fit", points, "--model", "line", "--threshold", 0.06).stdout
+
+
+@pytest.mark.parametrize("scale", [1e-12, 1.0, 1e12])
+def test_a_note_where_the_inliers_leave_the_model_open(run, tmp_path, scale):
+    rng = np.random.default_rng(0)
+    table = np.column_stack([np.full(30, 3.0 * scale), rng.uniform(0, 1, 30)])
+    np.savetxt(tmp_path / "one_x.csv", table, delimiter=",")
+    text = run("fit", "one_x.csv", "--model", "line", "--threshold", 0.3).stdout
+    assert "the inliers do not determine the model (rank 1 of 2)" in text
+    table[0, 0] *= 2.0
+    np.savetxt(tmp_path / "two_x.csv", table, delimiter=",")
+    assert "\nnote " not in run("fit", "two_x.csv", "--model", "line", "--threshold", 0.6).stdout
+
+
+def test_a_header_of_numbers(run, tmp_path):
+    rng = np.random.default_rng(0)
+    np.savetxt(tmp_path / "a.csv", rng.uniform(0, 1, (20, 2)), delimiter=",", header="0,1", comments="")
+    args = ("fit", "a.csv", "--model", "line", "--threshold", 0.1)
+    result = run(*args)
+    assert " of 21 " in result.stdout
+    assert "note: line 1 of a.csv (0, 1) is taken for data" in result.stderr
+    for option, count in (("--header", 20), ("--no-header", 21)):
+        result = run(*args, option)
+        assert f" of {count} " in result.stdout
+        assert result.stderr == ""
+    for command in (("curve", "a.csv", "--model", "line"), ("alternatives", *args[1:])):
+        assert " of 20 " in run(*command, "--header").stdout or "points  20" in run(*command, "--header").stdout

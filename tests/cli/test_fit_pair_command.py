@@ -175,3 +175,15 @@ def test_the_rectified_pair_of_scikit_image(run, tmp_path):
     assert counts["auto"] > 0.93
     assert counts["F32=1"] > 0.9
     assert counts["F33=1"] < 0.4
+
+
+def test_a_note_where_the_matches_do_not_determine_the_matrix(run, pair, tmp_path):
+    path, scene = pair
+    args = ("--method", "peel", "--threshold", 0.03)
+    assert "\nnote " not in run("fit-pair", path, *args).stdout
+    assert json.loads(run("fit-pair", path, *args, "--json", "-").stdout)["note"] is None
+    X = np.column_stack([scene.x1, np.ones(60)]).T
+    savemat(tmp_path / "same.mat", {"data": {"matches": {"X1": X, "X2": X}}})
+    text = " ".join(run("fit-pair", "same.mat", *args).stdout.split())
+    assert "note one homography explains 60 of the 60 inliers" in text
+    assert "they do not determine F" in json.loads(run("fit-pair", "same.mat", *args, "--json", "-").stdout)["note"]

@@ -216,3 +216,56 @@ def test_too_few_rows(tmp_path):
     table = read(tmp_path, "1,2,3\n4,5,6\n7,8,9\n")
     with pytest.raises(Failure, match=r"a plane with 3 parameters needs at least 4 rows of data, but .* has 3"):
         pose(table, [0, 1, 2], "plane")
+
+
+def test_a_header_of_numbers(tmp_path, capsys):
+    file = write(tmp_path, "2019,2020\n1.5,2\n2.5,4.5\n3.5,6.5\n")
+    table = read_table(file, header=True)
+    assert table.names == ("2019", "2020")
+    assert values(table) == [[1.5, 2.0], [2.5, 4.5], [3.5, 6.5]]
+    assert capsys.readouterr().err == ""
+    table = read_table(file)
+    assert len(values(table)) == 4
+    assert "line 1 of " in (note := capsys.readouterr().err)
+    assert "(2019, 2020) is taken for data; --header takes it for names" in note
+    table = read_table(file, header=False)
+    assert len(values(table)) == 4
+    assert capsys.readouterr().err == ""
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "1,2\n3,4\n5,6\n",  # whole numbers throughout
+        "0,1\n1,2.5\n2,3.5\n",  # an x that is a count
+        "0,0\n1.5,2.5\n2.5,3.5\n",  # no two columns have one name
+        "0.5,1\n1.5,2.5\n2.5,3.5\n",
+        "1950,0.44\n1951,0.47\n",
+        "1,2\n",
+    ],
+)
+def test_no_note_where_the_first_line_looks_like_the_others(tmp_path, capsys, text):
+    values(read(tmp_path, text))
+    assert capsys.readouterr().err == ""
+
+
+def test_a_word_in_a_first_line_with_numbers(tmp_path):
+    with pytest.raises(Failure, match=r"line 1, column 1: 'id' is not a number; --header takes this line for names"):
+        values(read(tmp_path, "id,2019\n1,2\n3,4\n"))
+    with pytest.raises(Failure, match=r"line 1, column 1: 'id' is not a number$"):
+        values(read_table(write(tmp_path, "id,2019\n1,2\n"), header=False))
+    with pytest.raises(Failure, match=r"line 2, column 2: 'x' is not a number$"):
+        values(read(tmp_path, "1,2\n3,x\n"))
+
+
+def test_words_are_data_where_there_is_no_header(tmp_path):
+    with pytest.raises(Failure, match=r"line 1, column 1: 'a' is not a number"):
+        values(read_table(write(tmp_path, "a,b\n1,2\n"), header=False))
+
+
+def test_a_header_alone_or_in_an_array(tmp_path):
+    with pytest.raises(Failure, match="holds no data, only the line '1, 2'"):
+        read_table(write(tmp_path, "1,2\n"), header=True)
+    np.save(tmp_path / "a.npy", np.ones((3, 2)))
+    with pytest.raises(Failure, match="is an NPY file, which has no header line"):
+        read_table(str(tmp_path / "a.npy"), header=True)

@@ -7,6 +7,7 @@ pytest.importorskip("torch")
 
 from maxcon.agent.search_networks import load_search_networks
 from maxcon.datasets.synthetic import synthetic_hyperplane
+from maxcon.experiments.search_instances import table_source
 
 
 @pytest.fixture
@@ -46,8 +47,9 @@ def test_on_tables_of_ones_own(run, fails, tmp_path):
     args = ("train", "search", "--data", "mine", "--updates", 1, "--out", "nets")
     assert "--data needs --threshold" in fails(*args)
     assert run(*args, "--threshold", 0.1).exit_code == 0
-    (folder / "x.csv").write_text("a,b\n1,2\n")
+    (folder / "x.csv").write_text("a,b\n1,2\n3,x\n")
     assert "x.csv must be a table of numbers" in fails(*args, "--threshold", 0.1)
+    assert "there is no folder" in fails("train", "search", "--data", "none", "--threshold", 0.1, "--out", "other")
     assert "has none" in fails("train", "search", "--data", tmp_path, "--threshold", 0.1, "--out", "other")
 
 
@@ -56,3 +58,14 @@ def test_learners_and_families_must_fit(fails):
     assert "--learner optima teaches search, not line" in fails("train", "line", "--learner", "optima")
     assert "--paper, --from and --set are for agents" in fails("train", "search", "--paper")
     assert "--threshold is for the tables" in fails("train", "line", "--threshold", 0.1)
+
+
+def test_tables_with_a_header(tmp_path):
+    (tmp_path / "x.csv").write_text("# made\na,b\n" + "".join(f"1,{k / 7}\n" for k in range(60)), encoding="utf-8")
+    problem, threshold = table_source(tmp_path, 0.1)(np.random.default_rng(0))
+    assert threshold == 0.1
+    assert problem.n_params == 1
+    assert set(problem.b) <= {k / 7 for k in range(60)}
+    (tmp_path / "x.csv").write_text("a,b\n", encoding="utf-8")
+    with pytest.raises(ValueError, match=r"x.csv must be a table of numbers: it holds no data"):
+        table_source(tmp_path, 0.1)

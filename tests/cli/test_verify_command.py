@@ -1,4 +1,8 @@
 import json
+import os
+import signal
+import threading
+import time
 
 import numpy as np
 import pytest
@@ -102,3 +106,39 @@ def test_what_cannot_be_read(fails, run, points, tmp_path):
 @pytest.mark.usefixtures("certificate")
 def test_data_that_cannot_be_read(fails):
     assert "there is no file 'none.csv'" in fails("verify", "cert.json", "none.csv")
+
+
+@pytest.mark.skipif(os.name != "posix", reason="sends SIGINT")
+def test_ctrl_c_ends_a_rerun(run, tmp_path, monkeypatch):
+    """HiGHS does not look up, here for ten seconds: what is known without it is shown at once."""
+    rng = np.random.default_rng(0)
+    X = rng.standard_normal((40, 3))
+    X[:30, 2] = X[:30, :2].sum(axis=1) + rng.uniform(-0.1, 0.1, 30)
+    np.save(tmp_path / "p.npy", X)
+    consensus = maxcon.fit(maxcon.hyperplane(X[:, :2], X[:, 2]), 0.1)
+    save(issue(consensus.problem, consensus), tmp_path / "bare.json")
+    done = threading.Event()
+
+    def solver(*_args, **_options):
+        signal.pthread_kill(threading.main_thread().ident, signal.SIGINT)
+        done.wait(10)
+
+    monkeypatch.setattr("scipy.optimize.milp", solver)
+    began = time.monotonic()
+    result = run("verify", "bare.json", "p.npy", "--rerun")
+    assert time.monotonic() - began < 9
+    done.set()
+    assert result.exit_code == 130
+    assert "accepted" in result.stdout
+    assert "not proven by the file (nor by the rerun: stopped by Ctrl-C)" in " ".join(result.stdout.split())
+
+
+def test_a_header_of_numbers(run, tmp_path):
+    rng = np.random.default_rng(0)
+    table = rng.uniform(0, 1, (20, 2))
+    np.savetxt(tmp_path / "a.csv", table, delimiter=",", header="0,1", comments="", fmt="%.17g")
+    assert (
+        run("fit", "a.csv", "--header", "--model", "line", "--threshold", 0.1, "--certificate", "c.json").exit_code == 0
+    )
+    assert run("verify", "c.json", "a.csv", "--header").exit_code == 0
+    assert run("verify", "c.json", "a.csv").exit_code == 1

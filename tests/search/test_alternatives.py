@@ -314,3 +314,47 @@ def test_other_results_are_refused():
         alternative_optima(problem, 0.1, maxcon.fit(problem, 0.1, method="greedy"))
     with pytest.raises(TypeError, match="problem must be a LinearProblem"):
         alternative_optima(3, 0.1)
+
+
+def contaminated():
+    """Points of which some quarter can be proven to be outliers in a moment, but not how many are."""
+    rng = np.random.default_rng(0)
+    X = rng.standard_normal((300, 8))
+    y = X @ rng.standard_normal(8) + rng.uniform(-0.1, 0.1, 300)
+    y[:120] += rng.uniform(-5, 5, 120)
+    return maxcon.hyperplane(X, y)
+
+
+@compiled_only
+@pytest.mark.parametrize("how", ["time", "callback", "ctrl-c"])
+def test_stopped_before_the_largest_consensus_is_proven(how, monkeypatch):
+    problem = contaminated()
+    calls = []
+    options = {"time_limit": 0.3} if how == "time" else {"callback": lambda n_found: calls.append(n_found) or True}
+    if how == "ctrl-c":
+        options = {}
+        exact = alternatives.exact
+
+        def interrupted(task):
+            yield next(exact(task))
+            raise KeyboardInterrupt
+
+        monkeypatch.setattr(alternatives, "exact", interrupted)
+    answer = alternative_optima(problem, 0.1, **options)
+    assert not answer.proven
+    assert not answer.complete
+    assert answer.n_inliers < answer.upper_bound <= 300
+    assert answer.masks.shape == (1, 300)
+    assert answer.masks.sum() == answer.n_inliers > 0
+    assert answer.values[0] <= 0.1 * (1 + 1e-6)
+    assert answer.unknown.all()
+    assert f"1 set or more of {answer.n_inliers} (at most {answer.upper_bound}) of 300 points" in repr(answer)
+    assert set(calls) <= {0}
+    assert (how == "callback") == bool(calls)
+
+
+def test_proven_optima_say_so():
+    table = load_table("cyg_ob1")
+    answer = alternative_optima(maxcon.line(table.x, table.y), 0.5)
+    assert answer.proven
+    assert answer.n_inliers == answer.upper_bound == 38

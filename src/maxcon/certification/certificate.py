@@ -6,6 +6,7 @@ It holds no code's word for anything that can be checked: the inliers follow fro
 
 from __future__ import annotations
 
+import errno
 import hashlib
 import json
 import math
@@ -147,6 +148,8 @@ def save(certificate: Certificate, path: str | os.PathLike[str]) -> None:
         If the file cannot be written.
     """
     target = Path(os.path.realpath(path))
+    if not target.parent.is_dir():
+        raise FileNotFoundError(errno.ENOENT, "there is no such folder", str(target.parent))
     handle, part = tempfile.mkstemp(dir=target.parent, prefix=f".{target.name}.", suffix=".part")
     try:
         with os.fdopen(handle, "wb") as file:

@@ -9,10 +9,13 @@ from __future__ import annotations
 
 import itertools
 import math
+import threading
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
 from fractions import Fraction
-from typing import Any, Literal
+from functools import partial
+from typing import Any, Literal, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,12 +23,16 @@ from numpy.typing import NDArray
 from maxcon.certification.exact import ExactData, independent_columns, within
 
 Floats = NDArray[np.float64]
+T = TypeVar("T")
 
 #: The number of d-subsets of a group from which a box is derived is at most this.
 MOST_SUBSETS = 20_000
 
 #: A d-subset whose matrix has a larger condition number confines nothing.
 SINGULAR = 1e10
+
+#: Seconds between two looks at whether Ctrl-C was pressed, where waiting would not be cut short by it.
+LOOK = 0.1
 
 #: So many places that are too deep are looked at; if none of them is, rounding makes a decision impossible.
 MOST_TRIALS = 100
@@ -73,6 +80,12 @@ def prove_again(A: Floats, b: Floats, limit: float, bound: int, time_limit: floa
         The claim.
     time_limit
         Seconds.
+
+    Returns
+    -------
+    Rerun
+        "unfinished" where the time is over, or Ctrl-C was pressed: then a solver at work is left to its own, and ends
+        with the process or at its time limit.
     """
     began = time.perf_counter()
     d = A.shape[1]
@@ -86,6 +99,8 @@ def prove_again(A: Floats, b: Floats, limit: float, bound: int, time_limit: floa
             found = _milp(A, b, limit, bound, began + time_limit)
     except _Undecided as reason:
         return Rerun("unfinished", solver, str(reason), 0, time.perf_counter() - began)
+    except KeyboardInterrupt:
+        return Rerun("unfinished", solver, "stopped by Ctrl-C", 0, time.perf_counter() - began)
     return Rerun("refuted" if found else "confirmed", solver, "", found, time.perf_counter() - began)
 
 
@@ -196,18 +211,14 @@ def _milp(A: Floats, b: Floats, limit: float, bound: int, deadline: float) -> in
         LinearConstraint(np.hstack([-rows, -big]), ub=1 - right),
         LinearConstraint(count[None, :], ub=N - bound - 1),
     ]
+    bounds = Bounds(np.r_[-np.ones(d), np.zeros(N)], np.ones(d + N))
     exact = ExactData(A, b)
     while True:
         left = deadline - time.perf_counter()
         if left <= 0:
             raise _Undecided("the time limit was reached")
-        answer = milp(
-            count,
-            integrality=count,
-            bounds=Bounds(np.r_[-np.ones(d), np.zeros(N)], np.ones(d + N)),
-            constraints=constraints,
-            options={"time_limit": left},
-        )
+        solve = partial(milp, count, integrality=count, bounds=bounds, constraints=tuple(constraints))
+        answer = _interruptible(partial(solve, options={"time_limit": left}))
         if answer.status == 2:
             return 0
         if answer.x is None:
@@ -225,6 +236,26 @@ def _milp(A: Floats, b: Floats, limit: float, bound: int, deadline: float) -> in
         cut = np.zeros(d + N)
         cut[d + refuted] = 1.0
         constraints.append(LinearConstraint(cut[None, :], lb=1.0))
+
+
+def _interruptible(function: Callable[[], T]) -> T:
+    """Call `function` such that Ctrl-C ends the wait for it: HiGHS itself would not look up before it is done."""
+    returned: list[T] = []
+    raised: list[BaseException] = []
+
+    def work() -> None:
+        try:
+            returned.append(function())
+        except BaseException as error:  # for the caller, whatever it is
+            raised.append(error)
+
+    thread = threading.Thread(target=work, daemon=True)
+    thread.start()
+    while thread.is_alive():
+        thread.join(LOOK)
+    if raised:
+        raise raised[0]
+    return returned[0]
 
 
 def _chebyshev(A: Floats, b: Floats) -> tuple[Floats, NDArray[np.intp]]:

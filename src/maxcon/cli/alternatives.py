@@ -46,6 +46,7 @@ def command(
     model: str,
     threshold: float,
     columns: str | None,
+    header: bool | None,
     limit: int,
     time_limit: float | None,
     json_out: str | None,
@@ -53,10 +54,11 @@ def command(
     """List all largest sets of points in FILE that one model explains, and tell which points they share.
 
     FILE is read as `maxcon fit` reads it. `maxcon fit` returns one largest consensus set; where others are as large,
-    their models may differ by far, and only the points that are in all of them are inliers beyond doubt.
+    their models may differ by far, and only the points that are in all of them are inliers beyond doubt. Where the time
+    ends before the largest consensus is proven, the best set found is shown, and none is looked for beside it.
 
     The JSON object holds the file, the model's family, the columns and every field of maxcon.AlternativeOptima:
-    n_inliers, masks, models, values, complete, in_all, in_none, varying, threshold, seconds.
+    n_inliers, upper_bound, proven, masks, models, values, complete, in_all, in_none, varying, threshold, seconds.
 
     \b
     Examples:
@@ -65,7 +67,7 @@ def command(
     """
     if json_out is not None:
         check_output(json_out, "--json")
-    table = read_table(file)
+    table = read_table(file, header)
     used = choose_columns(table, columns, model)
     problem = pose(table, used, model)
     names = [table.names[column] for column in used]
@@ -75,7 +77,7 @@ def command(
         about = {"file": table.source, "family": model, "columns": names}
         write_output(json_out, result_json(about, answer))
     if json_out != "-":
-        notes = ["compiling included"] * bool(compilations.buffer) + ["stopped by Ctrl-C"] * interrupted.is_set()
+        notes = ["compiling not counted"] * bool(compilations.buffer) + ["stopped by Ctrl-C"] * interrupted.is_set()
         _show(answer, names, f"{model} through {table.source}, threshold {threshold:g}", notes)
         if json_out is not None:
             click.echo(f"wrote {json_out}")
@@ -101,7 +103,12 @@ def _show(answer: AlternativeOptima, names: Sequence[str], heading: str, notes: 
     out.print(Text(heading, style="bold"))
     N = answer.masks.shape[1]
     table = borderless()
-    table.add_row("consensus", f"{answer.n_inliers} of {N} ({answer.n_inliers / N:.1%}), proven to be the largest")
+    size = f"{answer.n_inliers} of {N} ({answer.n_inliers / N:.1%}), "
+    if answer.proven:
+        table.add_row("consensus", f"{size}proven to be the largest")
+    else:
+        text = f"{size}not proven to be the largest: at most {answer.upper_bound} are possible"
+        table.add_row("consensus", Text(text, style="yellow"))
     table.add_row("sets", _sets(answer))
     for label, mask in (("in all", answer.in_all), ("in none", answer.in_none), ("varying", answer.varying)):
         table.add_row(label, rows(mask))
@@ -119,6 +126,8 @@ def _show(answer: AlternativeOptima, names: Sequence[str], heading: str, notes: 
 def _sets(answer: AlternativeOptima) -> Text:
     if answer.n_inliers == 0:
         return Text("none: no model explains even one point within the threshold", style="red")
+    if not answer.proven:
+        return Text("not looked for: first the largest consensus must be proven, which takes more time", style="yellow")
     if not answer.complete:
         return Text(f"{answer.n_found} found, there may be more", style="yellow")
     return Text("one only" if answer.n_found == 1 else f"{answer.n_found}, no others", style="green")

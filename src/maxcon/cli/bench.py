@@ -111,7 +111,7 @@ def command(
         bench.check_settings(settings)
         folder = check_folder(out, "--out")
         file = BenchFile(folder, bench.header(settings))
-    interrupted = _run(settings, file)
+    interrupted = _run(settings, file, mention_absent=methods is None)
     units = file.units
     if units:
         _page(folder, units)
@@ -120,14 +120,17 @@ def command(
         ctx.exit(INTERRUPTED)
 
 
-def _run(settings: Settings, file: BenchFile) -> bool:
-    """Run what is missing; return whether Ctrl-C ended that, after the instance under way."""
+def _run(settings: Settings, file: BenchFile, *, mention_absent: bool) -> bool:
+    """Run what is missing; return whether Ctrl-C ended that, after the instance under way.
+
+    It says which peers are absent where no methods were asked for by name.
+    """
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn  # noqa: PLC0415
 
     from maxcon.cli.present import console  # noqa: PLC0415
     from maxcon.experiments.bench import absent_peers, run_bench  # noqa: PLC0415
 
-    for name, package in absent_peers().items():
+    for name, package in absent_peers().items() if mention_absent else ():
         click.echo(f"{name} is not installed and left out (pip install {package})", err=True)
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
     with deferred() as stop, Progress(*columns, console=console(stderr=True), transient=True) as display:

@@ -44,6 +44,7 @@ def command(
     file: str,
     model: str,
     columns: str | None,
+    header: bool | None,
     low: float,
     high: float | None,
     time_limit: float | None,
@@ -73,7 +74,7 @@ def command(
     if plot_out is not None:
         check_output(plot_out, "--plot", PICTURES)
         check_matplotlib()
-    table = read_table(file)
+    table = read_table(file, header)
     used = choose_columns(table, columns, model)
     problem = pose(table, used, model)
     names = [table.names[column] for column in used]
@@ -86,7 +87,7 @@ def command(
         about = {"file": table.source, "family": model, "columns": names, "knees": curve.knees()}
         write_output(json_out, result_json(about, curve))
     if "-" not in (json_out, plot_out):
-        notes = ["compiling included"] * bool(compilations.buffer) + ["stopped by Ctrl-C"] * interrupted.is_set()
+        notes = ["compiling not counted"] * bool(compilations.buffer) + ["stopped by Ctrl-C"] * interrupted.is_set()
         _show(curve, f"{model} through {table.source}", notes)
         for out in (json_out, plot_out):
             if out is not None:

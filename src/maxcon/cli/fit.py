@@ -51,6 +51,7 @@ def command(
     model: str,
     threshold: float,
     columns: str | None,
+    header: bool | None,
     method: str,
     refine: str,
     seed: int,
@@ -93,7 +94,7 @@ def command(
     if plot_out is not None:
         check_output(plot_out, "--plot", PICTURES)
         check_matplotlib()
-    table = read_table(file)
+    table = read_table(file, header)
     used = choose_columns(table, columns, model)
     problem = pose(table, used, model)
     names = [table.names[column] for column in used]

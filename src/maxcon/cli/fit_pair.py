@@ -107,7 +107,8 @@ def command(
     A*-NAPA-DIBP published) stands for matches and images.
 
     The JSON object holds the files, the chart, F (3x3, pixels, [x2, 1] F [x1, 1] = 0), the matches x1 and x2 and
-    their Sampson distances in pixels, and every field of maxcon.Consensus; model, residuals and threshold there are
+    their Sampson distances in pixels, a note where the inliers do not determine F (of one plane, or the camera has
+    only turned), else null, and every field of maxcon.Consensus; model, residuals and threshold there are
     those of the linear problem.
 
     \b
@@ -207,6 +208,8 @@ def pair_table(pair: Pair, found: FundamentalFit, refine: str | None, notes: lis
     else:
         table.add_row("method", f"{consensus.method}, then {REFINED_BY[refine]}")
     table.add_row("time", ", ".join([duration(consensus.seconds), *notes]))
+    if found.degeneracy.note is not None:
+        table.add_row("note", Text(found.degeneracy.note, style="yellow"))
     if np.isfinite(found.F).all():
         table.add_row("Sampson", f"median {number(found.median_sampson)} pixels (inliers, F of rank 2)")
         rows = ["  ".join(f"{value:12.5e}" for value in row) for row in found.F]
@@ -235,6 +238,7 @@ def _json(pair: Pair, found: FundamentalFit) -> bytes:
         "chart": found.chart,
         "F": found.F,
         "median_sampson": found.median_sampson,
+        "note": found.degeneracy.note,
         "x1": pair.x1,
         "x2": pair.x2,
         "sampson": found.sampson,

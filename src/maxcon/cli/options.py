@@ -9,6 +9,13 @@ import click
 
 F = TypeVar("F", bound=Callable[..., Any])
 
+#: Whether the first line of a CSV file is a header.
+header_option = click.option(
+    "--header/--no-header",
+    default=None,
+    help="Whether the first line of CSV text is a header. Default: if it has no number.",
+)
+
 #: Which table is fitted, by what, and with which of its columns.
 _TABLE = (
     click.argument("file"),
@@ -19,6 +26,7 @@ _TABLE = (
         help="Names or numbers (from 1) of the columns to use, separated by commas, the dependent one last. "
         "Default: all columns.",
     ),
+    header_option,
 )
 
 #: How `maxcon.fit` searches.

@@ -47,6 +47,8 @@ def consensus_table(consensus: Consensus, names: Sequence[str], refine: str | No
     table.add_row("model", Text(equation(consensus.model, names)))
     table.add_row("inliers", f"{consensus.n_inliers} of {N} ({consensus.n_inliers / N:.1%})")
     table.add_row("proof", proof(consensus))
+    if (remark := caution(consensus)) is not None:
+        table.add_row("note", Text(remark, style="yellow"))
     if consensus.status == "optimal" or refine is None:
         table.add_row("method", consensus.method)
     else:
@@ -73,6 +75,22 @@ def proof(consensus: Consensus) -> Text:
     if consensus.status == "infeasible":
         return Text("no model explains even one point within the threshold", style="red")
     return Text("none: nothing is proven, so another model may have more inliers", style="yellow")
+
+
+def caution(consensus: Consensus) -> str | None:
+    """Return what makes the model worth little, though nothing is wrong with the fit; None if nothing does."""
+    n_inliers, d = consensus.n_inliers, consensus.problem.n_params
+    if n_inliers == 0:
+        return None
+    if n_inliers <= d:
+        found = f"so few inliers say nothing: {d} points nearly always have a model through them"
+        return found + "; a larger --threshold may find more"
+    A = consensus.problem.A[consensus.inlier_mask]
+    sizes = np.abs(consensus.problem.A).max(axis=0)
+    rank = int(np.linalg.matrix_rank(A / np.where(sizes > 0, sizes, 1.0)))
+    if rank < d:
+        return f"the inliers do not determine the model (rank {rank} of {d}): other models explain them as well"
+    return None
 
 
 def equation(model: Sequence[float] | np.ndarray[Any, Any], names: Sequence[str]) -> str:

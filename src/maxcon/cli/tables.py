@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path
 
+import click
 import numpy as np
 from numpy.typing import NDArray
 
@@ -42,22 +43,37 @@ class DataTable:
         Shape (N, columns): text from a CSV file, numbers from an NPY file.
     places
         Where each row stands in the file, for messages: "line 7" or "row 7".
+    guessed
+        Whether nobody has said that the first row is data: it is a line of text that may be a header.
     """
 
     source: str
     names: tuple[str, ...]
     cells: list[list[str]] | NDArray[np.float64]
     places: Sequence[str]
+    guessed: bool = False
 
     def numbers(self, columns: Sequence[int]) -> NDArray[np.float64]:
-        """Return the chosen columns, shape (N, len(columns)); Failure names the first cell that is no finite number."""
+        """Return the chosen columns, shape (N, len(columns)); Failure names the first cell that is no finite number.
+
+        Where the first row may be a header after all, a note on stderr says that it is taken for data.
+        """
         values = np.empty((len(self.cells), len(columns)))
         for row, cells in enumerate(self.cells):
             for slot, column in enumerate(columns):
                 value = _number(cells[column])
                 if value is None or not math.isfinite(value):
-                    raise Failure(f"{self.source}, {self.places[row]}, {self._label(column)}: {_fault(cells[column])}")
+                    hint = "; --header takes this line for names" if self.guessed and row == 0 else ""
+                    fault = _fault(cells[column]) + hint
+                    raise Failure(f"{self.source}, {self.places[row]}, {self._label(column)}: {fault}")
                 values[row, slot] = value
+        if self.guessed and _looks_like_names([[str(row[column]) for column in columns] for row in self.cells]):
+            first = _listed([str(self.cells[0][column]) for column in columns])
+            click.echo(
+                f"note: {self.places[0]} of {self.source} ({first}) is taken for data; --header takes it for names, "
+                "--no-header silences this note",
+                err=True,
+            )
         return values
 
     def _label(self, column: int) -> str:
@@ -65,15 +81,17 @@ class DataTable:
         return given if self.names[column] == given else f"{given} ({self.names[column]})"
 
 
-def read_table(file: str) -> DataTable:
+def read_table(file: str, header: bool | None = None) -> DataTable:
     """Read a CSV or NPY file, told apart by their first bytes; "-" is standard input.
+
+    Whether the first line of CSV text is a header may be told; None: it is one if it has no number.
 
     Where there is no such file, the name may be that of a table in the package (`maxcon.datasets.classic`).
 
     Raises
     ------
     Failure
-        If the file cannot be read, holds no data, or is neither.
+        If the file cannot be read, holds no data, or is neither, or an NPY file is told to have a header.
     """
     source = "standard input" if file == "-" else file
     try:
@@ -87,6 +105,8 @@ def read_table(file: str) -> DataTable:
     except OSError as error:
         raise Failure(f"cannot read {file!r}: {error.strerror}") from None
     if content.startswith(b"\x93NUMPY"):
+        if header:
+            raise Failure(f"{source} is an NPY file, which has no header line")
         return _parse_npy(content, source)
     if content.startswith(b"PK"):
         raise Failure(f"{source} is a zip archive (NPZ, XLSX?): only CSV text and NPY arrays can be read")
@@ -94,7 +114,7 @@ def read_table(file: str) -> DataTable:
         text = content.decode("utf-8-sig")
     except UnicodeDecodeError as error:
         raise Failure(f"{source} is neither an NPY file nor UTF-8 text (byte {error.start + 1})") from None
-    return _parse_csv(text, source)
+    return _parse_csv(text, source, header)
 
 
 def choose_columns(table: DataTable, wanted: str | None, model: str) -> list[int]:
@@ -164,7 +184,7 @@ def _parse_npy(content: bytes, source: str) -> DataTable:
     return DataTable(source, names, array.astype(np.float64), [f"row {row + 1}" for row in range(len(array))])
 
 
-def _parse_csv(text: str, source: str) -> DataTable:
+def _parse_csv(text: str, source: str, header: bool | None = None) -> DataTable:
     lines: list[tuple[int, str]] = []
     remark = ""  # the comment just above the first line
     for number, content in enumerate(text.splitlines(), start=1):
@@ -181,7 +201,10 @@ def _parse_csv(text: str, source: str) -> DataTable:
         if len(row) != width:
             raise Failure(f"{source}, line {number}: {_cells(len(row))}, but line {lines[0][0]} has {width}")
     # A first line with any number in it is data: then a typing error in it is reported, not taken for a name.
-    if any(_number(cell) is not None for cell in rows[0]):
+    guessed = header is None
+    if header is None:
+        header = all(_number(cell) is None for cell in rows[0])
+    if not header:
         names = _names_in(remark, delimiter, width)
     else:
         names = rows.pop(0)
@@ -189,7 +212,18 @@ def _parse_csv(text: str, source: str) -> DataTable:
         if not rows:
             raise Failure(f"{source} holds no data, only the line {', '.join(names)!r}")
     named = tuple(name or f"column {column + 1}" for column, name in enumerate(names))
-    return DataTable(source, named, rows, [f"line {number}" for number, _ in lines])
+    return DataTable(source, named, rows, [f"line {number}" for number, _ in lines], guessed and not header)
+
+
+def _looks_like_names(rows: list[list[str]]) -> bool:
+    """Whether a first line of numbers may be meant as names: all different whole ones (years, or 0, 1, 2) above others.
+
+    In each column most of the numbers below must be written otherwise, as 3.5 or 1e3.
+    """
+    first, others = rows[0], rows[1:SNIFFED_LINES]
+    whole = all(cell.isdecimal() for cell in first) and len(set(first)) == len(first)
+    decimal = [sum(not row[column].lstrip("+-").isdecimal() for row in others) for column in range(len(first))]
+    return whole and bool(others) and min(decimal) > len(others) / 2
 
 
 def _names_in(remark: str, delimiter: str, width: int) -> list[str]:

@@ -71,7 +71,8 @@ class _HeldOut(NamedTuple):
     "--data",
     metavar="FOLDER",
     help="Fundamental matrices from a KITTI odometry folder (matches of frame pairs) or from ModelNet40 (meshes); for "
-    "the search, your own tables (.npy, .csv: A beside b, as `maxcon fit-pair --rows` writes).  [default: made data]",
+    "the search, your own tables (.npy, .csv: A, with a column of ones for an intercept, beside b, as `maxcon fit-pair "
+    "--rows` writes).  [default: made data]",
 )
 @click.option(
     "--threshold", type=float, metavar="E", help="Of the tables of --data: the largest residual of an inlier."

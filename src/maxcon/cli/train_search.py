@@ -54,6 +54,8 @@ def train_search(
     recipe = Recipe(labels="optima" if learner == "optima" else "best")
     began = time.monotonic()
     again = f"maxcon train search --learner {learner} --seed {seed} --updates {rounds} --out {folder}"
+    if data is not None:
+        again += f" --data {data} --threshold {threshold:g}"
 
     with noticed() as interrupted:
 

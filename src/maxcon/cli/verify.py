@@ -9,7 +9,10 @@ import click
 from rich.text import Text
 
 from maxcon.certification import Certificate, CertificateError, VerificationReport, load, verify
+from maxcon.cli import INTERRUPTED
 from maxcon.cli.errors import Failure
+from maxcon.cli.interrupt import noticed
+from maxcon.cli.options import header_option
 from maxcon.cli.output import check_output, write_output
 from maxcon.cli.present import borderless, console, duration, plain
 from maxcon.cli.tables import N_COLUMNS, choose_columns, pose, read_table
@@ -33,6 +36,7 @@ REFUSED, UNPROVEN = 1, 3
     help="Names or numbers (from 1) of the columns that were fitted, separated by commas, the dependent one last. "
     "Default: all columns.",
 )
+@header_option
 @click.option(
     "--threshold", type=float, metavar="E", help="Refuse a certificate that is about another threshold than this."
 )
@@ -55,6 +59,7 @@ def command(
     data: str,
     model: str | None,
     columns: str | None,
+    header: bool | None,
     threshold: float | None,
     rerun: bool,
     time_limit: float,
@@ -69,8 +74,8 @@ def command(
 
     DATA is a table as `maxcon fit` reads it; "-" reads standard input. Points are counted from 0. The exit
     code is 0 if the certificate is accepted, 1 if it is refused, 2 if something could not be read, and 3 if it is
-    accepted but its claim is proven neither by the file nor by --rerun. (The seal of a file guards against accidents; a
-    false claim is found out by what the file proves.)
+    accepted but its claim is proven neither by the file nor by --rerun; Ctrl-C ends a rerun, shows the rest, and gives
+    130. (The seal of a file guards against accidents; a false claim is found out by what the file proves.)
 
     \b
     Examples:
@@ -80,12 +85,14 @@ def command(
     if json_out is not None:
         check_output(json_out, "--json")
     certificate = _load(cert)
+    stopped = False
     if isinstance(certificate, str):
         report = _unreadable(certificate)
     else:
-        problem = _pose(data, columns, model or certificate.family)
-        with console(stderr=True).status("checking ..."):
+        problem = _pose(data, columns, header, model or certificate.family)
+        with noticed() as interrupted, console(stderr=True).status("checking ..."):
             report = verify(certificate, problem.A, problem.b, threshold=threshold, rerun=rerun, time_limit=time_limit)
+        stopped = interrupted.is_set()
     if json_out is not None:
         record = {"certificate": cert, "data": data, **asdict(report), "bound": report.bound}
         lines = [f"  {json.dumps(key)}: {json.dumps(plain(value))}" for key, value in record.items()]
@@ -94,6 +101,8 @@ def command(
         _show(report, None if isinstance(certificate, str) else certificate, f"{cert} about {data}")
     if not report.accepted:
         click.get_current_context().exit(REFUSED)
+    if stopped:
+        click.get_current_context().exit(INTERRUPTED)
     if not report.claim_confirmed:
         click.get_current_context().exit(UNPROVEN)
 
@@ -114,8 +123,8 @@ def _unreadable(reason: str) -> VerificationReport:
     return VerificationReport(False, reason, 0, 0, 0, 0, 0, 0, None, 0.0)
 
 
-def _pose(data: str, columns: str | None, family: str) -> LinearProblem:
-    table = read_table(data)
+def _pose(data: str, columns: str | None, header: bool | None, family: str) -> LinearProblem:
+    table = read_table(data, header)
     if family in N_COLUMNS:
         return pose(table, choose_columns(table, columns, family), family)
     values = table.numbers(choose_columns(table, columns, "hyperplane"))  # like one, but for the intercept

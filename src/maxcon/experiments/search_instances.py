@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from maxcon.datasets.synthetic import THRESHOLD, synthetic_hyperplane
 from maxcon.datasets.two_view_scene import synthetic_two_view
@@ -90,26 +91,47 @@ def draw_problem(families: Sequence[str], rng: np.random.Generator, ranges: Rang
     return problem, threshold
 
 
+def _read_csv(file: Path) -> NDArray[np.float64]:
+    """Return the numbers of a file with commas; a first line in which nothing is a number is a header."""
+    lines = [line for line in file.read_text(encoding="utf-8-sig").splitlines() if line.partition("#")[0].strip()]
+    if lines and not any(_is_number(cell) for cell in lines[0].split(",")):
+        lines = lines[1:]
+    if not lines:
+        raise ValueError("it holds no data")
+    return np.loadtxt(lines, delimiter=",", ndmin=2)
+
+
+def _is_number(cell: str) -> bool:
+    try:
+        float(cell)
+    except ValueError:
+        return False
+    return True
+
+
 def table_source(folder: Path, threshold: float) -> Callable[[np.random.Generator], tuple[LinearProblem, float]]:
     """Return what draws problems from one's own tables: random rows of a random table.
 
     Parameters
     ----------
     folder
-        Holds ``.npy`` or ``.csv`` files: A beside b, a point a row, no header.
+        Holds ``.npy`` or ``.csv`` files: A beside b, a point a row; for an intercept, A has a column of ones. CSV
+        has commas, and may have a header without numbers.
     threshold
         The largest residual of an inlier in all of them.
 
     Raises
     ------
     ValueError
-        If there is no such file, or one is no table of finite numbers with at least d + 2 rows.
+        If there is no such folder or no such file, or one is no table of finite numbers with at least d + 2 rows.
     """
     threshold = check_threshold(threshold)
+    if not folder.is_dir():
+        raise ValueError(f"data must be a folder with .npy or .csv tables, but there is no folder {str(folder)!r}")
     tables = []
     for file in sorted([*folder.glob("*.npy"), *folder.glob("*.csv")]):
         try:
-            table = np.load(file) if file.suffix == ".npy" else np.loadtxt(file, delimiter=",", ndmin=2)
+            table = np.load(file) if file.suffix == ".npy" else _read_csv(file)
         except (ValueError, OSError) as error:
             raise ValueError(f"{file.name} must be a table of numbers: {error}") from None
         if table.ndim != 2 or table.shape[1] < 2 or len(table) <= table.shape[1] or not np.isfinite(table).all():

@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 from maxcon.minimax.linear import OK, basis_points, cold_fit
 from maxcon.minimax.rows import linear_rows, whiten
 from maxcon.minimax.workspace import allocate
-from maxcon.problem import LinearProblem, check_indices
+from maxcon.problem import LinearProblem, check_indices, freeze_arrays
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,6 +31,9 @@ class MinimaxFit:
     model: NDArray[np.float64]
     value: float
     basis: NDArray[np.int64]
+
+    def __post_init__(self) -> None:
+        freeze_arrays(self)
 
 
 def minimax_fit(problem: LinearProblem, subset: ArrayLike | None = None) -> MinimaxFit:

@@ -9,6 +9,7 @@ import time
 from collections.abc import Callable
 from functools import cache
 from pathlib import Path
+from threading import get_ident
 from typing import Any, TypeVar, cast
 
 import numba
@@ -70,16 +71,11 @@ def _compiled(function: F, liberties: bool | set[str]) -> F:
 
 
 class _FirstCompilation(event.Listener):  # type: ignore[misc]
-    """Says once, on stderr, why the first call takes long; keeps the time that compiling takes."""
+    """Says once, on stderr, why the first call takes long."""
 
     said = False
-    seconds = 0.0
-
-    def __init__(self) -> None:
-        self._began: list[float] = []
 
     def on_start(self, event: Any) -> None:
-        self._began.append(time.perf_counter())
         dispatcher = event.data.get("dispatcher")
         module = getattr(getattr(dispatcher, "py_func", None), "__module__", None)  # None: of a user's own `exec`
         if not self.said and str(module).startswith("maxcon."):
@@ -90,26 +86,48 @@ class _FirstCompilation(event.Listener):  # type: ignore[misc]
             )
 
     def on_end(self, event: Any) -> None:
-        began = self._began.pop()
-        if not self._began:  # a kernel that another one calls is part of its compilation
-            self.seconds += time.perf_counter() - began
+        pass
+
+
+class _Making(event.Listener):  # type: ignore[misc]
+    """Keeps the time that kernels take to be compiled or, in every later process, to be loaded from disk."""
+
+    seconds = 0.0
+
+    def __init__(self) -> None:
+        self._threads: list[int] = []  # those at it, or waiting for one that is; once for each kernel in another
+        self._since = 0.0
+
+    def on_start(self, event: Any) -> None:
+        if not self._threads:
+            self._since = time.perf_counter()
+        self._threads.append(get_ident())
+
+    def on_end(self, event: Any) -> None:
+        if get_ident() in self._threads:
+            self._threads.remove(get_ident())
+            if not self._threads:
+                self.seconds += time.perf_counter() - self._since
 
     def so_far(self) -> float:
-        """Return the seconds of all compilations, with the one that another thread may be at."""
-        began = self._began[:1]
-        return self.seconds + (time.perf_counter() - began[0] if began else 0.0)
+        """Return the seconds of all kernels, with the one that another thread may be at."""
+        # A thread that asks is at no kernel: Ctrl-C has met it while it waited for the lock, and it got no end.
+        while get_ident() in self._threads:
+            self._threads.remove(get_ident())
+        return self.seconds + (time.perf_counter() - self._since if self._threads else 0.0)
 
 
-_compilations = _FirstCompilation()
+_making = _Making()
 if not config.DISABLE_JIT:
-    event.register("numba:compile", _compilations)
+    event.register("numba:compile", _FirstCompilation())
+    event.register("numba:compiler_lock", _making)
 
 
 def compile_seconds() -> float:
-    """Return how long this process has compiled kernels so far; time limits do not count it."""
-    return _compilations.so_far()
+    """Return how long this process has compiled and loaded kernels so far; time limits do not count it."""
+    return _making.so_far()
 
 
 def working_clock() -> float:
-    """Return the time in seconds, from some moment on, without what compiling takes."""
+    """Return the time in seconds, from some moment on, without what compiling and loading kernels takes."""
     return time.perf_counter() - compile_seconds()

@@ -2,6 +2,7 @@
 
 from maxcon.problem.consensus import Consensus, Status
 from maxcon.problem.explanation import Explanation
+from maxcon.problem.frozen import freeze_arrays
 from maxcon.problem.linear import LinearProblem, hyperplane, line, plane
 from maxcon.problem.protocol import Problem
 from maxcon.problem.tolerance import inlier_slack
@@ -16,6 +17,7 @@ __all__ = [
     "check_indices",
     "check_model",
     "check_threshold",
+    "freeze_arrays",
     "hyperplane",
     "inlier_slack",
     "line",

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from maxcon.problem.explanation import Explanation
+from maxcon.problem.frozen import freeze_arrays
 from maxcon.problem.linear import LinearProblem
 
 Status = Literal["optimal", "bounded", "heuristic", "infeasible"]
@@ -18,6 +19,8 @@ Status = Literal["optimal", "bounded", "heuristic", "infeasible"]
 @dataclass(frozen=True, eq=False)
 class Consensus:
     """A model, the points that it explains within the threshold, and how good that is.
+
+    Its arrays are read-only.
 
     Attributes
     ----------
@@ -47,7 +50,8 @@ class Consensus:
     seed
         What seeded the random numbers (drawn or not), or None where a generator was passed.
     seconds
-        Wall-clock time of the fit; kernels that were compiled on the way, once on a machine, are not counted.
+        Wall-clock time of the fit, without that of compiling kernels, once on a machine, and of loading them, once in a
+        process.
     problem
         What was fitted.
     """
@@ -66,6 +70,9 @@ class Consensus:
     seed: int | None
     seconds: float
     problem: LinearProblem = field(repr=False)
+
+    def __post_init__(self) -> None:
+        freeze_arrays(self)
 
     def explain(self, point: int, *, time_limit: float | None = 10.0) -> Explanation:
         """Explain why a point is no inlier: which inliers speak against it, and what it would cost to force it in.

@@ -7,6 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from maxcon.problem.frozen import freeze_arrays
+
 
 @dataclass(frozen=True, eq=False)
 class Explanation:
@@ -33,3 +35,6 @@ class Explanation:
     consensus_with_point: int
     lost: int
     proven: bool
+
+    def __post_init__(self) -> None:
+        freeze_arrays(self)

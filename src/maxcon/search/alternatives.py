@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -11,8 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from maxcon.minimax import allocate, linear_rows, minimax_fit
+from maxcon.minimax.jit import working_clock
 from maxcon.minimax.linear import OK, cold_fit
-from maxcon.problem import Consensus, LinearProblem, check_threshold
+from maxcon.problem import Consensus, LinearProblem, check_threshold, freeze_arrays
 from maxcon.problem.validate import check_callback, check_time_limit
 from maxcon.search.alternative_kernels import (
     DONE,
@@ -33,6 +33,9 @@ from maxcon.search.exact import exact
 from maxcon.search.partition import exact_partition
 from maxcon.search.proof import prove
 from maxcon.search.refine import swap_refinement
+
+#: With these, the largest consensus is known: that of the result, or none.
+PROVEN = ("optimal", "infeasible")
 
 #: Work between two looks at the clock, in points of the fits that a node may take: some 10 ms.
 PIECE = 800_000
@@ -55,7 +58,13 @@ class AlternativeOptima:
     Attributes
     ----------
     n_inliers
-        How many points each has: the largest consensus, 0 if no model explains any point.
+        How many points each has: the largest consensus, 0 if no model explains any point. Where `proven` is False, the
+        most that was found.
+    upper_bound
+        No model explains more points than this.
+    proven
+        Whether `n_inliers` is proven to be the largest consensus, so that it equals `upper_bound`. Where it is not, in
+        the time that there was, one set of that size is given, and nothing is known about the points.
     masks
         Shape (K, N), bool: the sets found, each once, those with the smallest f(S) first.
     models
@@ -63,7 +72,7 @@ class AlternativeOptima:
     values
         Shape (K,): its f(S), in the unit of b.
     complete
-        Whether these are all.
+        Whether these are all; never where `proven` is False.
     in_all
         Shape (N,), bool: points that are proven to be in every largest consensus set.
     in_none
@@ -73,10 +82,12 @@ class AlternativeOptima:
     threshold
         The inlier threshold.
     seconds
-        Wall-clock time.
+        Wall-clock time, without that of compiling and loading kernels.
     """
 
     n_inliers: int
+    upper_bound: int
+    proven: bool
     masks: NDArray[np.bool_]
     models: NDArray[np.float64]
     values: NDArray[np.float64]
@@ -86,6 +97,9 @@ class AlternativeOptima:
     varying: NDArray[np.bool_]
     threshold: float
     seconds: float
+
+    def __post_init__(self) -> None:
+        freeze_arrays(self)
 
     @property
     def n_found(self) -> int:
@@ -100,8 +114,9 @@ class AlternativeOptima:
 
     def __repr__(self) -> str:
         count = f"{self.n_found} set{'s' * (self.n_found != 1)}" + ("" if self.complete else " or more")
+        size = str(self.n_inliers) if self.proven else f"{self.n_inliers} (at most {self.upper_bound})"
         return (
-            f"AlternativeOptima({count} of {self.n_inliers} of {self.masks.shape[1]} points, "
+            f"AlternativeOptima({count} of {size} of {self.masks.shape[1]} points, "
             f"{int(self.in_all.sum())} in all, {int(self.in_none.sum())} in none, {int(self.varying.sum())} varying)"
         )
 
@@ -129,9 +144,11 @@ def alternative_optima(
     limit
         So many sets are listed at most; the points in all or in none are then looked for one by one.
     time_limit
-        Seconds after which what is known is returned; None for no limit.
+        Seconds after which what is known is returned; None for no limit. Where the largest consensus is not proven by
+        then, that is the best set found, with `proven` False. Ctrl-C does the same.
     callback
-        Called now and then with how many sets have been found; a true return value stops.
+        Called now and then with how many sets have been found, 0 until the largest consensus is proven; a true return
+        value stops.
 
     Raises
     ------
@@ -140,8 +157,6 @@ def alternative_optima(
     ValueError
         If an argument is out of its range, or `consensus` is not of this problem and threshold, not proven optimal,
         or refuted by a larger set.
-    ArithmeticError
-        If the time is over before the largest consensus is proven.
 
     Notes
     -----
@@ -152,7 +167,7 @@ def alternative_optima(
     parameters interval stabbing answers, otherwise the partition search. What has been answered is then kept, or out,
     from the start, which makes a second search for all sets short.
     """
-    began = time.perf_counter()
+    began = working_clock()
     if not isinstance(problem, LinearProblem):
         raise TypeError(f"problem must be a LinearProblem, but it is a {type(problem).__name__}")
     threshold = check_threshold(threshold)
@@ -162,23 +177,23 @@ def alternative_optima(
         raise ValueError(f"limit must be at least 1, but it is {limit}")
     check_time_limit(time_limit)
     check_callback(callback)
+    stopped = False
     task = make_task(problem, threshold, np.random.default_rng(0), time_limit)
     if consensus is None:
-        consensus = conclude(task, run(task, exact(task), swap_refinement), "exact", 0, 0.0)
-        if consensus.gap > 0:
-            raise ArithmeticError(
-                f"the largest consensus is not proven: {consensus.n_inliers} found, {consensus.upper_bound} possible"
-            )
+        best = run(task, exact(task), swap_refinement, None if callback is None else lambda _progress: callback(0))
+        consensus, stopped = conclude(task, best, "exact", 0, 0.0), best.interrupted
     else:
         _check_consensus(consensus, problem, threshold)
     lister = _Lister(task, consensus, int(limit), callback)
-    if consensus.n_inliers > 0:
+    if stopped or not lister.proven:
+        pass  # all that is known is the set itself
+    elif consensus.n_inliers > 0:
         with suppress(_StoppedError, KeyboardInterrupt):
             lister.run()
     else:
         lister.complete = True  # the empty set is the only one
         lister.ever_out[:] = True
-    return lister.result(time.perf_counter() - began)
+    return lister.result(working_clock() - began)
 
 
 def _check_consensus(consensus: Consensus, problem: LinearProblem, threshold: float) -> None:
@@ -191,7 +206,7 @@ def _check_consensus(consensus: Consensus, problem: LinearProblem, threshold: fl
         raise ValueError("consensus must be of this problem, but it is of other data")
     if consensus.threshold != threshold:
         raise ValueError(f"consensus must be at the threshold {threshold}, but it is at {consensus.threshold}")
-    if consensus.status not in {"optimal", "infeasible"}:
+    if consensus.status not in PROVEN:
         raise ValueError(f"consensus must be proven optimal, but its status is {consensus.status!r}")
 
 
@@ -206,8 +221,10 @@ class _Lister:
         self.task, self.limit, self.callback = task, limit, callback
         N = task.problem.n_points
         self.n_inliers = consensus.n_inliers
+        self.proven = consensus.status in PROVEN
+        self.upper_bound = consensus.n_inliers if self.proven else consensus.upper_bound
         self.n_outliers = N - consensus.n_inliers
-        self.incumbent = consensus.inlier_mask
+        self.incumbent = consensus.inlier_mask.copy()  # kernels take arrays that can be written
         self.stabs = task.rows.At.shape[0] <= STABBED
         self.n_nodes = max(PIECE // ((self.n_outliers + 1) * N), 1)
         self.badness = np.where(np.isfinite(consensus.residuals), consensus.residuals, 0.0)
@@ -324,6 +341,8 @@ class _Lister:
         order = sorted(range(len(masks)), key=lambda k: fits[k].value)
         return AlternativeOptima(
             n_inliers=self.n_inliers,
+            upper_bound=self.upper_bound,
+            proven=self.proven,
             masks=np.array([masks[k] for k in order], dtype=np.bool_).reshape(-1, problem.n_points),
             models=np.array([fits[k].model for k in order]).reshape(-1, problem.n_params),
             values=np.array([fits[k].value for k in order]),

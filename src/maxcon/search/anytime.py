@@ -40,7 +40,7 @@ class Task:
     gap
         The gap at which the search may stop.
     compiled
-        What `compile_seconds` said when the deadline was set: kernels compiled since do not count.
+        What `compile_seconds` said when the deadline was set: kernels compiled or loaded since do not count.
     """
 
     problem: LinearProblem

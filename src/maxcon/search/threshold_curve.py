@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass
@@ -14,7 +13,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from maxcon.minimax import linear_rows, minimax_fit
-from maxcon.problem import LinearProblem, inlier_slack
+from maxcon.minimax.jit import working_clock
+from maxcon.problem import LinearProblem, freeze_arrays, inlier_slack
 from maxcon.problem.tolerance import ABSOLUTE_SLACK, RELATIVE_SLACK
 from maxcon.problem.validate import check_number, check_time_limit
 from maxcon.search.anytime import Step, Task, make_task, run
@@ -61,7 +61,7 @@ class ConsensusCurve:
         Whether each breakpoint of the range is proven. Otherwise the truth lies between `consensus` and
         `upper_bound`.
     seconds
-        Wall-clock time.
+        Wall-clock time, without that of compiling and loading kernels.
     """
 
     counts: NDArray[np.int64]
@@ -75,6 +75,9 @@ class ConsensusCurve:
     scale: float
     complete: bool
     seconds: float
+
+    def __post_init__(self) -> None:
+        freeze_arrays(self)
 
     def consensus(self, threshold: ArrayLike) -> Any:
         """Return the largest consensus at each threshold (the largest known, where the curve is not complete).
@@ -229,7 +232,7 @@ def consensus_curve(
     next k is the middle of the longest run of those of which nothing tells one from another, so that the curve is
     known roughly soon, and then ever better.
     """
-    began = time.perf_counter()
+    began = working_clock()
     if not isinstance(problem, LinearProblem):
         raise TypeError(f"problem must be a LinearProblem, but it is a {type(problem).__name__}")
     low, high = _check_range(thresholds)
@@ -309,7 +312,7 @@ class _Search:
     def search(self, threshold: float) -> bool:
         """Make exact searches at a threshold until one proves its answer; False where the time is over."""
         for method in self.methods:
-            left = None if self.deadline is None else max(self.deadline - time.perf_counter(), 1e-9)
+            left = None if self.deadline is None else max(self.deadline - working_clock(), 1e-9)
             task = make_task(self.problem, threshold, np.random.default_rng(0), left)
             best = run(task, method(task), swap_refinement)
             if best.subset is not None and best.size > 0:
@@ -385,5 +388,5 @@ class _Search:
             n_points=self.problem.n_points,
             scale=self.problem.scale,
             complete=bool(settled[inside].all()),
-            seconds=time.perf_counter() - began,
+            seconds=working_clock() - began,
         )

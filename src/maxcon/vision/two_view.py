@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -12,9 +13,10 @@ from numpy.typing import ArrayLike, NDArray
 from maxcon.datasets.cameras import epipolar_rows, transformed
 from maxcon.fitting import fit
 from maxcon.minimax.jit import working_clock
-from maxcon.problem import Consensus, check_threshold
+from maxcon.problem import Consensus, check_threshold, freeze_arrays
 from maxcon.problem.validate import check_time_limit
 from maxcon.search.anytime import Progress
+from maxcon.vision.degeneracy import Degeneracy, degeneracy
 from maxcon.vision.epipolar import (
     check_matches,
     enforce_rank_two,
@@ -53,6 +55,9 @@ class FundamentalFit:
     sampson: NDArray[np.float64]
     symmetric: NDArray[np.float64]
 
+    def __post_init__(self) -> None:
+        freeze_arrays(self)
+
     @property
     def chart(self) -> str:
         """The chart: "auto", "F32=1" or "F33=1"."""
@@ -72,6 +77,11 @@ class FundamentalFit:
     def median_sampson(self) -> float:
         """The median Sampson distance of the inliers, in pixels; NaN where there is no F."""
         return float(np.median(self.sampson[self.inlier_mask])) if self.inlier_mask.any() else float("nan")
+
+    @cached_property
+    def degeneracy(self) -> Degeneracy:
+        """Whether the inliers determine F: its `note` says so where they do not. Found when it is first asked for."""
+        return degeneracy(self.problem, self.inlier_mask, self.median_sampson)
 
     def __repr__(self) -> str:
         return f"FundamentalFit(chart={self.chart!r}, {self.consensus!r})"
