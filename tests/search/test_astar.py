@@ -7,8 +7,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from numba import config
 
 from instances import BUILDERS, synthetic
+from maxcon.experiments.bench_cells import Cell, make_instance
 from maxcon.minimax import allocate, linear_rows
 from maxcon.minimax.linear import INFEASIBLE, OK, cold_fit
 from maxcon.problem import LinearProblem
@@ -17,8 +19,11 @@ from maxcon.search.anytime import Best, Task, make_task, run
 from maxcon.search.astar import AStarStats, astar, astar_napa, astar_napa_dibp
 from maxcon.search.astar_nodes import MADE, allocate_nodes, enlarged, find, make, pop, push
 from maxcon.search.insertion_kernels import FEWEST, allocate_insertion, insertion_bound
+from maxcon.search.learned import learned
 from maxcon.search.sweep import exact_sweep
 from oracles import brute_force_consensus, highs_minimax
+
+compiled_only = pytest.mark.skipif(config.DISABLE_JIT, reason="takes minutes where kernels are interpreted")
 
 VARIANTS = {"astar": astar, "astar-napa": astar_napa, "astar-napa-dibp": astar_napa_dibp}
 
@@ -47,8 +52,12 @@ def compare(name: str, seed: int) -> None:
     A, b, threshold = small_instance(name, seed)
     expected = brute_force_consensus(A, b, threshold)
     task = task_of(A, b, threshold)
-    pruned_only = {"astar-dibp": lambda task, **options: astar(task, dibp=True, **options)}
-    for variant, method in (VARIANTS | pruned_only).items():
+    others = {
+        "astar-dibp": lambda task, **options: astar(task, dibp=True, **options),
+        "learned": lambda task, **options: astar(task, learned=True, **options),
+        "learned-dibp": lambda task, **options: astar_napa_dibp(task, learned=True, **options),
+    }
+    for variant, method in (VARIANTS | others).items():
         best, stats = solve(task, method)
         assert (best.size, best.upper_bound) == (expected, expected), (name, seed, variant, stats)
         assert stats.stopped == ""
@@ -122,6 +131,21 @@ def test_acceleration_makes_no_more_nodes_on_the_papers_data(N, d, rate):
             assert stats[name].unique <= stats["astar"].unique
             assert stats[name].expanded <= stats["astar"].expanded
     assert unique["astar-napa-dibp"] < unique["astar-napa"] <= unique["astar"]
+
+
+@compiled_only
+def test_the_belief_saves_nodes_on_two_view_problems():
+    """From the same set: what is gained is gained by the order in which the heuristic puts points back."""
+    expanded = np.zeros(2)
+    for number in range(4):
+        instance = make_instance(Cell("fundamental", 100, 15), number, 0)
+        start = run(task := make_task(instance.problem, instance.threshold, np.random.default_rng(0)), learned(task))
+        for k, options in enumerate(({"start": start.subset}, {"learned": True})):
+            task = make_task(instance.problem, instance.threshold, np.random.default_rng(0))
+            best, stats = solve(task, astar_napa, **options)
+            assert best.size == best.upper_bound == start.size
+            expanded[k] += stats.expanded
+    assert expanded[1] <= 0.75 * expanded[0]
 
 
 def test_counts_add_up():
@@ -241,7 +265,7 @@ def feasible_counts(rows, limit):
 
 @pytest.mark.parametrize("name", ["synthetic_some", "quantised", "duplicate_a", "uniform_noise", "collinear_most"])
 def test_heuristic_is_admissible(name):
-    """With and without enforced points it is at most the fewest points that must go, and 1 if any must."""
+    """With and without enforced points and doubts it is at most the fewest points that must go, and 1 if any must."""
     for seed in range(2):
         rng = np.random.default_rng([seed, len(name)])
         A, b = BUILDERS[name](rng, 9, 2)
@@ -262,7 +286,8 @@ def test_heuristic_is_admissible(name):
                 continue
             assert status == OK
             fewest = int(inside.sum()) - max(s.bit_count() for s in rest)
-            scratch = allocate_insertion(task.rows)
+            scratch = allocate_insertion(task.rows, believing=bool(rng.random() < 0.7))
+            scratch.doubt[:] = rng.integers(0, 5, len(scratch.doubt)) / 4
             bound = insertion_bound(workspace, task.limit, 100, scratch)
             assert bound <= fewest
             assert (bound >= 1) == (fewest >= 1)
@@ -312,6 +337,7 @@ def test_options():
         ({"napa": 1}, TypeError, "napa must be True or False"),
         ({"dibp": "yes"}, TypeError, "dibp must be True or False"),
         ({"improve": None}, TypeError, "improve must be True or False"),
+        ({"learned": 1}, TypeError, "learned must be True or False"),
         ({"node_limit": 0}, ValueError, "node_limit must be at least 1"),
         ({"node_limit": 1.5}, TypeError, "node_limit must be an integer"),
         ({"memory_limit": -1}, ValueError, "memory_limit must be at least 0"),

@@ -222,6 +222,22 @@ def test_its_sets_are_refined():
     assert swap_refinement(task, steps[-1].subset).sum() == steps[-1].subset.sum()
 
 
+def test_it_tells_what_it_believes():
+    A, b = synthetic(np.random.default_rng(3), 100, 8, 0.3)
+    belief = np.full(100, np.nan)
+    best = run(task := task_for(A, b, 0.1), learned(task, belief=belief))
+    assert ((belief > 0) & (belief < 1)).all()
+    assert np.array_equal(belief > 0.5, best.subset)
+    other = np.full(100, np.nan)
+    again = run(task := task_for(A, b, 0.1), learned(task, belief=other))
+    assert np.array_equal(best.subset, again.subset)
+    assert np.array_equal(belief, other)
+    with pytest.raises(ValueError, match=r"belief must be an array of shape \(100,\)"):
+        learned(task, belief=np.zeros(99))
+    with pytest.raises(ValueError, match=r"belief must be an array of shape \(100,\)"):
+        learned(task, belief=np.zeros(100, dtype=np.float32))
+
+
 def test_bad_options_are_named(tmp_path):
     rng = np.random.default_rng(0)
     task = task_for(rng.normal(size=(10, 2)), rng.normal(size=10), 0.1)

@@ -56,7 +56,7 @@ def assert_sound(A: Floats, b: Floats, threshold: float, best: Best, consensus: 
 
 @pytest.mark.parametrize("name", sorted(BUILDERS))
 def test_every_family_against_brute_force(name: str) -> None:
-    """With any size of the groups, from a good start or an empty one, with one thread or two."""
+    """With any size of the groups, from a good start or an empty one, in any order, with one thread or two."""
     for seed in few(10):
         rng = np.random.default_rng([seed, *name.encode()])
         A, b, threshold = small_instance(name, rng)
@@ -64,7 +64,8 @@ def test_every_family_against_brute_force(name: str) -> None:
         task = task_for(A, b, threshold)
         start = None if rng.random() < 0.7 else np.zeros(len(b), dtype=np.bool_)
         leaf = int(rng.choice([1, 2, 3, 5, 8, 20])) if rng.random() < 0.8 else None
-        best = run(task, exact_partition(task, start=start, leaf=leaf, n_jobs=1 + seed % 2))
+        belief = None if seed % 3 else rng.random(len(b))
+        best = run(task, exact_partition(task, start=start, belief=belief, leaf=leaf, n_jobs=1 + seed % 2))
         if consensus == 0:
             assert best.upper_bound == 0
             continue
@@ -172,8 +173,9 @@ def test_an_allowance_of_work_ends_at_the_same_place() -> None:
         task = task_for(A, b, 0.1)
         search = PartitionSearch(task, n_jobs=1, max_work=300_000)
         best = run(task, search.steps())
-        results.append((best.size, best.upper_bound, search._work()))
+        results.append((best.size, best.upper_bound, search._work(), search.expanded))
     assert results[0] == results[1]
+    assert 100 < results[0][3] < results[0][2]
     assert best.size < best.upper_bound < 100
     task = task_for(A, b, 0.1)
     more = run(task, exact_partition(task, n_jobs=1, max_work=3_000_000))
@@ -211,6 +213,9 @@ def test_options() -> None:
     task = task_for(np.eye(5, 4), np.zeros(5), 1.0)
     with pytest.raises(ValueError, match=r"start must be a boolean mask of shape \(5,\), but it is int"):
         exact_partition(task, start=np.zeros(5, dtype=np.int64))  # type: ignore[arg-type]
+    for belief in (np.zeros(4), np.full(5, 1.5), np.full(5, np.nan)):
+        with pytest.raises(ValueError, match=r"belief must be probabilities of shape \(5,\)"):
+            exact_partition(task, belief=belief)
     with pytest.raises(ValueError, match="leaf must be at least 1, but it is 0"):
         exact_partition(task, leaf=0)
     with pytest.raises(ValueError, match="n_jobs must be -1 or at least 1, but it is 0"):

@@ -28,7 +28,8 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from itertools import chain
 
 import numpy as np
 from numpy.typing import NDArray
@@ -56,6 +57,7 @@ from maxcon.search.astar_kernels import (
 )
 from maxcon.search.astar_nodes import MADE, QUEUED, allocate_nodes, bytes_needed, enlarged
 from maxcon.search.insertion_kernels import FEWEST, FITS, note_model
+from maxcon.search.learned import learned as learned_search
 from maxcon.search.sampling import check_count
 
 #: Nodes that there is room for at first.
@@ -126,6 +128,7 @@ def astar(
     napa: bool = False,
     dibp: bool = False,
     improve: bool = True,
+    learned: bool = False,
     start: NDArray[np.bool_] | None = None,
     node_limit: int | None = None,
     memory_limit: int = MEMORY_LIMIT,
@@ -158,6 +161,10 @@ def astar(
     improve
         Refine each best set by swaps (`maxcon.search.refine`), where the published code uses another local
         method of its authors (IBCO). False for the bare search.
+    learned
+        Begin with the learned search (`maxcon.search.learned`): with its set, and with its belief for the heuristic,
+        which removes first what is probably an outlier, and puts points back by falling belief. Neither paper has
+        this; where the heuristic is not at its limit of N / (d + 1), it makes several times fewer nodes.
     start
         Shape (N,), bool, or indices: a feasible set to begin with, from another method. The better it is, the
         more is pruned.
@@ -190,7 +197,7 @@ def astar(
     same, likewise; and it keeps nodes whose e is equal to the outliers of the best set, which cannot improve
     it.
     """
-    for name, value in (("napa", napa), ("dibp", dibp), ("improve", improve)):
+    for name, value in (("napa", napa), ("dibp", dibp), ("improve", improve), ("learned", learned)):
         if not isinstance(value, (bool, np.bool_)):
             raise TypeError(f"{name} must be True or False, but it is {value!r}")
     most = np.iinfo(np.int32).max if node_limit is None else check_count(node_limit, "node_limit", 1)
@@ -200,16 +207,19 @@ def astar(
     elif not isinstance(stats, AStarStats):
         raise TypeError(f"stats must be an AStarStats or None, but it is a {type(stats).__name__}")
     n = task.rows.At.shape[0] + 1
-    search = allocate_search(task.rows, allocate_nodes(task.problem.n_points, max(FIRST_NODES, n + 1)))
+    nodes = allocate_nodes(task.problem.n_points, max(FIRST_NODES, n + 1))
+    search = allocate_search(task.rows, nodes, bool(learned))
     if start is not None:
         _begin_with(task, search, check_indices(start, task.problem.n_points, "start"))
-    return _steps(task, search, bool(napa), bool(dibp), bool(improve), most, memory, stats)
+    steps = _steps(task, search, bool(napa), bool(dibp), bool(improve), most, memory, stats)
+    return chain(_learn(task, search), steps) if learned else steps
 
 
 def astar_napa(
     task: Task,
     *,
     improve: bool = True,
+    learned: bool = False,
     start: NDArray[np.bool_] | None = None,
     node_limit: int | None = None,
     memory_limit: int = MEMORY_LIMIT,
@@ -217,7 +227,14 @@ def astar_napa(
 ) -> Iterator[Step]:
     """`astar` with non-adjacent path avoidance; its other options, steps and errors are the same."""
     return astar(
-        task, napa=True, improve=improve, start=start, node_limit=node_limit, memory_limit=memory_limit, stats=stats
+        task,
+        napa=True,
+        improve=improve,
+        learned=learned,
+        start=start,
+        node_limit=node_limit,
+        memory_limit=memory_limit,
+        stats=stats,
     )
 
 
@@ -225,6 +242,7 @@ def astar_napa_dibp(
     task: Task,
     *,
     improve: bool = True,
+    learned: bool = False,
     start: NDArray[np.bool_] | None = None,
     node_limit: int | None = None,
     memory_limit: int = MEMORY_LIMIT,
@@ -236,6 +254,7 @@ def astar_napa_dibp(
         napa=True,
         dibp=True,
         improve=improve,
+        learned=learned,
         start=start,
         node_limit=node_limit,
         memory_limit=memory_limit,
@@ -254,6 +273,19 @@ def _begin_with(task: Task, search: Search, subset: NDArray[np.bool_]) -> None:
             f"{workspace.x[-1] * task.rows.scale:g} for its {int(subset.sum())} points"
         )
     note_model(workspace, task.limit, search.scratch)
+
+
+def _learn(task: Task, search: Search) -> Iterator[Step]:
+    """Let the search know the set of the learned search, and its belief."""
+    best, belief = np.zeros(task.problem.n_points, dtype=np.bool_), search.scratch.doubt
+    for step in learned_search(replace(task, deadline=np.inf), belief=belief):  # so that it ends by itself
+        if step.subset is not None:
+            best = step.subset
+        yield step
+    belief[:] = 1.0 - belief
+    workspace = allocate(task.rows, best)
+    if best.any() and cold_fit(*workspace) == OK:
+        note_model(workspace, task.limit, search.scratch)
 
 
 def _steps(

@@ -103,8 +103,8 @@ class Search(NamedTuple):
     tally: NDArray[np.int64]
 
 
-def allocate_search(rows: LinearRows, nodes: Nodes) -> Search:
-    """Return a search that has not begun."""
+def allocate_search(rows: LinearRows, nodes: Nodes, believing: bool = False) -> Search:
+    """Return a search that has not begun; `believing`: with room for doubts, see `Insertion`."""
     d, N = rows.At.shape
     n = d + 1
     state = np.zeros(N_STATE, dtype=np.int64)
@@ -116,7 +116,7 @@ def allocate_search(rows: LinearRows, nodes: Nodes) -> Search:
     tally = np.zeros(N_TALLY, dtype=np.int64)
     return Search(
         allocate(rows),
-        allocate_insertion(rows),
+        allocate_insertion(rows, believing),
         allocate_copies(rows, n + 1),
         allocate_refinement(rows),
         nodes,

@@ -11,6 +11,9 @@ once.
 The same on a set of which some points are *enforced*, that is, known inliers, bounds what the set costs under
 that condition: the bases then are those of the constrained fits, and their enforced points are not counted
 as used.
+
+Where it is known which points are probably outliers, these are removed first of all, and everything is put back by
+rising doubt: each basis counted then uses up one probable outlier, where a basis of all points can use up d + 1.
 """
 
 from __future__ import annotations
@@ -49,6 +52,8 @@ class Insertion(NamedTuple):
         Shape (2,): how many points are outside that set (N before the first), and how many fits were made.
     out, basis, model
         Shapes (N,), (d + 1,) and (d + 1,): scratch.
+    doubt
+        Shape (N,): how probable it is that the point is an outlier, from 0 to 1; shape (0,): nothing is believed.
     """
 
     inliers: NDArray[np.bool_]
@@ -57,10 +62,11 @@ class Insertion(NamedTuple):
     out: NDArray[np.int64]
     basis: NDArray[np.int64]
     model: NDArray[np.float64]
+    doubt: NDArray[np.float64]
 
 
-def allocate_insertion(rows: LinearRows) -> Insertion:
-    """Return what the kernels need, with no set met yet."""
+def allocate_insertion(rows: LinearRows, believing: bool = False) -> Insertion:
+    """Return what the kernels need, with no set met yet; `believing`: room for doubts, all of them 0."""
     d, N = rows.At.shape
     return Insertion(
         np.zeros(N, dtype=np.bool_),
@@ -69,6 +75,7 @@ def allocate_insertion(rows: LinearRows) -> Insertion:
         np.zeros(N, dtype=np.int64),
         np.zeros(d + 1, dtype=np.int64),
         np.zeros(d + 1),
+        np.zeros(N if believing else 0),
     )
 
 
@@ -243,11 +250,43 @@ def take_out(ws: Workspace, basis: NDArray[np.int64], size: int) -> None:
 
 
 @kernel
-def _remove_bases(ws: Workspace, limit: float, scratch: Insertion) -> int:
-    """Remove bases until the rest fits; return how many points are in `out` then, -1 if a fit failed."""
+def _remove_doubtful(ws: Workspace, limit: float, scratch: Insertion) -> int:
+    """Remove the points that are probably outliers; return how many are in `out` then, -1 if the fit failed."""
+    gain, out, doubt = ws.gain, scratch.out, scratch.doubt
+    n_out = 0
+    for i in range(doubt.shape[0]):
+        if doubt[i] > 0.5 and gain[i] == 1.0:
+            out[n_out] = i
+            n_out += 1
+    if n_out == 0:
+        return 0
+    take_out(ws, out, n_out)
+    for j in range(ws.x.shape[0]):
+        scratch.model[j] = ws.x[j]
+    _begin_at(ws, scratch.model)
+    scratch.counts[FITS] += 1
+    return n_out if _fit_within(ws, limit) == OK else -1
+
+
+@kernel
+def _sort_by_doubt(out: NDArray[np.int64], n_out: int, doubt: NDArray[np.float64]) -> None:
+    for m in range(1, n_out):
+        i = out[m]
+        k = m
+        while k > 0 and doubt[out[k - 1]] > doubt[i]:
+            out[k] = out[k - 1]
+            k -= 1
+        out[k] = i
+
+
+@kernel
+def _remove_bases(ws: Workspace, limit: float, n_out: int, scratch: Insertion) -> int:
+    """Remove bases until the rest fits; return how many points are in `out` then, -1 if a fit failed.
+
+    `n_out` points are there before.
+    """
     gain, cap, x, r, out = ws.gain, ws.cap, ws.x, ws.r, scratch.out
     n = x.shape[0]
-    n_out = 0
     lowest = np.inf
     for count in range(2 * r.shape[0] + 1):
         gamma = x[n - 1]
@@ -305,10 +344,14 @@ def insertion_bound(ws: Workspace, limit: float, enough: int, scratch: Insertion
     """
     gain, cap, x, r, out = ws.gain, ws.cap, ws.x, ws.r, scratch.out
     n = x.shape[0]
-    n_out = _remove_bases(ws, limit, scratch)
+    n_out = _remove_doubtful(ws, limit, scratch)
+    if n_out >= 0:
+        n_out = _remove_bases(ws, limit, n_out, scratch)
     if n_out < 0:
         return 0
     note_model(ws, limit, scratch)
+    if scratch.doubt.shape[0] > 0:
+        _sort_by_doubt(out, n_out, scratch.doubt)
     count = 0
     for m in range(n_out):
         i = out[m]

@@ -30,6 +30,7 @@ from maxcon.search.learned_kernels import (
     finish_search,
     play_parts,
     play_rounds,
+    read_belief,
 )
 from maxcon.search.learned_memory import (
     AGREEMENT,
@@ -89,6 +90,7 @@ def learned(
     network: str | Path | SearchNetworks | None = None,
     rounds: int | None = None,
     settings: Settings | None = None,
+    belief: NDArray[np.float64] | None = None,
 ) -> Iterator[Step]:
     """Search with the learned agent: propose, walk down the tree, believe, swap; again and again.
 
@@ -114,6 +116,9 @@ def learned(
         half), else 24 and at least as many as the progress took.
     settings
         The settings of a round; None for the defaults.
+    belief
+        Shape (N,), float64: is told, when the search has ended by itself, with what probability each point is an
+        inlier of the best set.
 
     Yields
     ------
@@ -136,10 +141,17 @@ def learned(
         raise TypeError(f"network must be a file name or a pair of networks, but it is a {type(network).__name__}")
     if rounds is not None:
         rounds = check_count(rounds, "rounds", 1)
-    return _search(task, nets, rounds, Settings() if settings is None else check_settings(settings))
+    N = task.problem.n_points
+    if belief is not None and not (
+        isinstance(belief, np.ndarray) and belief.shape == (N,) and belief.dtype == np.float64
+    ):
+        raise ValueError(f"belief must be an array of shape ({N},) and type float64 to write to")
+    return _search(task, nets, rounds, Settings() if settings is None else check_settings(settings), belief)
 
 
-def _search(task: Task, nets: SearchNetworks, rounds: int | None, settings: Settings) -> Iterator[Step]:
+def _search(
+    task: Task, nets: SearchNetworks, rounds: int | None, settings: Settings, belief: NDArray[np.float64] | None
+) -> Iterator[Step]:
     began = working_clock()
     end = began + task.seconds_left()
     arena, walk = _root(task, nets, settings)
@@ -172,6 +184,8 @@ def _search(task: Task, nets: SearchNetworks, rounds: int | None, settings: Sett
             reported, spoken = int(counts[SIZE]), (now := working_clock())
     if not counts[SWAPPED] and end - now > SWAP_ROUNDS * sum(took):
         finish_search(arena, limit)
+    if belief is not None:
+        read_belief(arena, belief)
     yield _news(counts, member, reported)
 
 

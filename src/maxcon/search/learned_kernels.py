@@ -482,3 +482,9 @@ def play_rounds(arena: Arena, limit: float, settings: Settings, rounds: int) -> 
 def finish_search(arena: Arena, limit: float) -> None:
     """Refine and swap the incumbent for the last time."""
     swap_part(carve(arena), limit)
+
+
+@kernel
+def read_belief(arena: Arena, p: NDArray[np.float64]) -> None:
+    """Write what is believed of each point now."""
+    p[:] = carve(arena).belief.p

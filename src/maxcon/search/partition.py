@@ -26,6 +26,7 @@ from maxcon.search.partition_moves import sum_up
 from maxcon.search.partition_state import (
     BEST,
     CUR,
+    EXPANDED,
     FOUND,
     INCUMBENT,
     JOB,
@@ -78,6 +79,7 @@ def exact_partition(
     task: Task,
     *,
     start: NDArray[np.bool_] | None = None,
+    belief: NDArray[np.float64] | None = None,
     leaf: int | None = None,
     n_jobs: int = -1,
     max_work: int | None = None,
@@ -90,6 +92,9 @@ def exact_partition(
         What is fitted.
     start
         Shape (N,), bool: a feasible set from any other method; the larger it is, the faster the proof. None: find one.
+    belief
+        Shape (N,): how probable it is that the point is an inlier, from 0 to 1. The search branches on improbable ones
+        first, largest residual first, then on the least probable one. None: on the largest residual under `start`.
     leaf
         How many points a group has at first, at least 1; None: from d and the number of outliers of `start`.
     n_jobs
@@ -108,7 +113,7 @@ def exact_partition(
     ValueError
         If an option has the wrong shape or is outside its range.
     """
-    return PartitionSearch(task, start=start, leaf=leaf, n_jobs=n_jobs, max_work=max_work).steps()
+    return PartitionSearch(task, start=start, belief=belief, leaf=leaf, n_jobs=n_jobs, max_work=max_work).steps()
 
 
 class _SpentError(Exception):
@@ -120,7 +125,7 @@ class PartitionSearch:
 
     Parameters
     ----------
-    task, start, leaf, n_jobs, max_work
+    task, start, belief, leaf, n_jobs, max_work
         See `exact_partition`.
 
     Attributes
@@ -136,6 +141,7 @@ class PartitionSearch:
         task: Task,
         *,
         start: NDArray[np.bool_] | None = None,
+        belief: NDArray[np.float64] | None = None,
         leaf: int | None = None,
         n_jobs: int = -1,
         max_work: int | None = None,
@@ -145,6 +151,8 @@ class PartitionSearch:
             raise ValueError(
                 f"start must be a boolean mask of shape ({n_points},), but it is {start.dtype} of shape {start.shape}"
             )
+        if belief is not None and (belief.shape != (n_points,) or not ((belief >= 0.0) & (belief <= 1.0)).all()):
+            raise ValueError(f"belief must be probabilities of shape ({n_points},), but it is {belief!r}")
         if leaf is not None and leaf < 1:
             raise ValueError(f"leaf must be at least 1, but it is {leaf}")
         self.task = task
@@ -152,10 +160,11 @@ class PartitionSearch:
         self.least_outliers = 0
         self._improved = False
         self._start = start
+        self._belief = belief
         self._leaf = leaf
         self._n_jobs = check_jobs(n_jobs)
         self._max_work = np.iinfo(np.int64).max if max_work is None else max_work
-        self._work_before = 0  # of states that are gone
+        self._work_before = self._expanded_before = 0  # of states that are gone
         self._budget = FIRST_BUDGET
         self._tree: MergeTree | None = None
         self._states: list[SearchState] = []
@@ -164,6 +173,11 @@ class PartitionSearch:
     def n_outliers(self) -> int:
         """The outliers of the largest set known."""
         return int(np.count_nonzero(~self.inliers))
+
+    @property
+    def expanded(self) -> int:
+        """How many nodes of the search were branched on so far, by all threads, in all deals."""
+        return self._expanded_before + sum(int(state.registers[EXPANDED]) for state in self._states)
 
     def groups(self) -> list[tuple[NDArray[np.int64], int]]:
         """Return disjoint groups of points, each with a proven lower bound on the outliers of any model among them.
@@ -216,7 +230,7 @@ class PartitionSearch:
         """Deal the points into groups by their residuals under the incumbent, and allocate a state for each thread."""
         rows = self.task.rows
         leaf = leaf_size(len(rows.b), len(rows.At), self.n_outliers) if self._leaf is None else self._leaf
-        self._work_before = self._work()
+        self._work_before, self._expanded_before = self._work(), self.expanded
         self._tree = merge_tree(residuals, leaf)
         bytes_each = state_bytes(len(rows.At), len(rows.b), self._tree)
         self._n_jobs = min(self._n_jobs, MOST_BYTES // bytes_each)
@@ -228,10 +242,13 @@ class PartitionSearch:
         self._adopt(residuals)
 
     def _adopt(self, residuals: NDArray[np.float64]) -> None:
-        """Make the largest set known, and the residuals of its model, the incumbent of every state."""
+        """Make the largest set known the incumbent of every state; its model's residuals tell where to branch."""
         assert self._tree is not None
+        rank = residuals
+        if self._belief is not None:
+            rank = np.where(self._belief > 0.5, 1.0 - self._belief, 1.0 + residuals)
         for state in self._states:
-            state.rank[:] = residuals[self._tree.order]
+            state.rank[:] = rank[self._tree.order]
             state.models[-1, 0] = ~self.inliers[self._tree.order]
             state.registers[[FOUND, INCUMBENT]] = self.n_outliers
 

@@ -62,6 +62,7 @@ from maxcon.search.partition_state import (
     ENFORCE,
     ENFORCED,
     EXACT,
+    EXPANDED,
     FIRST,
     GAIN,
     JOB,
@@ -346,6 +347,7 @@ def advance(s: SearchState, budget: int) -> int:
             registers[DEPTH] = f
             continue
         frames[f, COLUMN] = column
+        registers[EXPANDED] += 1
         p = lp_place[offset + column]
         save_bounds(frames, nodes, registers, trail, f)
         if count > 1 and not frames[f, CHAIN]:

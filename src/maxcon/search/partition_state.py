@@ -45,7 +45,8 @@ LINKS = 16  # tasks that the root has been cut into
 INCUMBENT = 17  # outliers of the incumbent
 BEST = 18  # outliers of the best model met in the present job (those of the incumbent at first)
 FOUND = 19  # outliers of the best model of all jobs; the first one met of its size
-N_REGISTERS = 20
+EXPANDED = 20  # how often the search has branched
+N_REGISTERS = 21
 
 # The columns of a frame.
 KIND = 0  # SOLVE or REFRESH
@@ -91,7 +92,7 @@ class SearchState(NamedTuple):
     At, b, limit
         Rows in the order of places, shapes (d, N) and (N,); shape (1,): residuals up to it are inliers.
     rank
-        Shape (N,): residual of each point under the incumbent; branching takes the largest.
+        Shape (N,): residual of each point under the incumbent, or doubt; branching takes the largest.
     nodes
         The merge tree and what is known of each node, shape (T, 12).
     leaf_of

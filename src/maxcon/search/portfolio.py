@@ -89,10 +89,10 @@ def _short(task: Task, left: float) -> Iterator[Step]:
 
 def _long(task: Task, left: float, n_jobs: int) -> Iterator[Step]:
     own = replace(task, deadline=task.deadline - (1.0 - LONG_SHARE) * left) if np.isfinite(left) else task
-    best = np.zeros(task.problem.n_points, dtype=np.bool_)
+    best, belief = np.zeros(task.problem.n_points, dtype=np.bool_), np.full(task.problem.n_points, 0.5)
     untimed = replace(task, deadline=np.inf)  # so that the learned search ends by itself
     first = propose(task) if task.problem.n_points <= PROPOSED_POINTS else iter(())
-    for step in chain(first, learned(untimed)):
+    for step in chain(first, learned(untimed, belief=belief)):
         if step.subset is not None and np.count_nonzero(step.subset) > np.count_nonzero(best):
             best = step.subset
         yield step
@@ -100,9 +100,9 @@ def _long(task: Task, left: float, n_jobs: int) -> Iterator[Step]:
             yield Step(subset=(best := _refined(task, best)), refined=True)
             break
     if np.isfinite(left):
-        yield from exact_partition(task, start=best, n_jobs=n_jobs)
+        yield from exact_partition(task, start=best, belief=belief, n_jobs=n_jobs)
     else:
-        yield from exact_partition(task, start=best, n_jobs=1, max_work=BRIEF_WORK)
+        yield from exact_partition(task, start=best, belief=belief, n_jobs=1, max_work=BRIEF_WORK)
 
 
 def _refined(task: Task, best: NDArray[np.bool_]) -> NDArray[np.bool_]:

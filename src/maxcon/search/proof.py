@@ -31,7 +31,8 @@ def prove(
 
     With up to three parameters by interval stabbing; where that ends or stalls without a proof (readings that are
     repeated and differ by just the threshold, extreme scales), it takes turns with the partition search. With more by
-    the partition search, from the best set of `propose`, of the learned search and of what is known.
+    the partition search, from the best set of `propose`, of the learned search and of what is known, in the order of
+    the learned search's belief.
 
     Parameters
     ----------
@@ -51,12 +52,13 @@ def prove(
     if task.problem.n_params <= MOST_PARAMETERS:
         yield from _take_turns(task, best, n_jobs)
         return
+    belief = np.full(task.problem.n_points, 0.5)
     untimed = replace(task, deadline=np.inf)  # so that the learned search ends by itself
-    for step in chain(propose(task), learned(untimed)):
+    for step in chain(propose(task), learned(untimed, belief=belief)):
         if step.subset is not None and np.count_nonzero(step.subset) > np.count_nonzero(best):
             best = step.subset
         yield step
-    yield from exact_partition(task, start=best, n_jobs=n_jobs, max_work=max_work)
+    yield from exact_partition(task, start=best, belief=belief, n_jobs=n_jobs, max_work=max_work)
 
 
 def _take_turns(task: Task, best: NDArray[np.bool_], n_jobs: int) -> Iterator[Step]:
