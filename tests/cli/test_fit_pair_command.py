@@ -1,13 +1,14 @@
+import inspect
 import json
 
 import numpy as np
 import pytest
 from scipy.io import savemat
 
-from maxcon.cli.fit_pair import _CHARTS, _THRESHOLD
+from maxcon.cli.fit_pair import _CHARTS, _PIXELS, _THRESHOLD
 from maxcon.cli.pair_picture import LINES, draw_matches, spread
 from maxcon.datasets import synthetic_two_view
-from maxcon.vision import CHARTS, sampson_distances
+from maxcon.vision import CHARTS, find_fundamental, sampson_distances
 from maxcon.vision.fundamental import USUAL_THRESHOLD
 from real_data import real_data
 
@@ -35,6 +36,9 @@ def test_it_shows_what_it_found(run, pair):
     assert "at most 60 are possible" in lines["bound"]
     assert lines["chart"].split()[-1] == "auto"
     assert "pixels" in lines["Sampson"]
+    assert int(lines["polished"].split()[1]) > 0.7 * scene.inlier_mask.sum()
+    assert "within 1 px of F" in lines["polished"]
+    assert "polished" not in run("fit-pair", path, "--method", "peel", "--threshold", 0.03, "--pixels", 0).stdout
     assert "F (pixels)" in result.stdout
 
 
@@ -49,6 +53,9 @@ def test_json_holds_the_matrix_and_the_matches(run, pair):
     np.testing.assert_allclose(record["x1"], scene.x1)
     np.testing.assert_allclose(record["sampson"], sampson_distances(F, scene.x1, scene.x2), rtol=1e-6)
     assert sum(record["inlier_mask"]) == record["n_inliers"]
+    assert record["pixels"] == 1.0
+    assert record["within_pixels"] == (sampson_distances(F, scene.x1, scene.x2) <= 1.0).tolist()
+    assert np.linalg.svd(record["F_linear"], compute_uv=False)[2] < 1e-12
     assert record["threshold"] == 0.03
 
 
@@ -83,6 +90,7 @@ def test_the_same_command_gives_the_same_result(run, pair):
         (("text.png", "text.png"), "text.png must be an image"),
         (("text.mat",), "text.mat must be a MATLAB 5 file"),
         (("pair.mat", "--threshold", "-1"), "threshold must be a positive finite number, but it is -1.0"),
+        (("pair.mat", "--pixels", "-1"), "pixels must be a positive finite number, but it is -1.0"),
         (("pair.mat", "--chart", "F11=1"), "Invalid value for '--chart'"),
         (("pair.mat", "--method", "luck"), "but it is 'luck'"),
         (("pair.mat", "--json", "-", "--picture", "-"), "--json and --picture cannot both go to standard output"),
@@ -114,6 +122,7 @@ def test_without_opencv_the_error_names_the_extra(fails, monkeypatch, tmp_path):
 def test_the_help_knows_the_charts_and_the_threshold():
     assert tuple(CHARTS) == _CHARTS
     assert USUAL_THRESHOLD == _THRESHOLD
+    assert inspect.signature(find_fundamental).parameters["pixels"].default == _PIXELS
 
 
 def test_lines_are_few_and_spread():

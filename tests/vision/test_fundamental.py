@@ -196,9 +196,21 @@ def test_the_estimate_has_at_most_the_loss_of_its_best_sample():
     assert losses[1] < losses[0]
 
 
+def test_the_chart_of_auto_is_rotated_to_an_estimate_that_is_given():
+    scene = synthetic_two_view(50, 0.5, np.random.default_rng(18))
+    posed = fundamental_problem(scene.x1, scene.x2, estimate=-3.0 * scene.F)
+    np.testing.assert_allclose(posed.matrix(np.zeros(8)), posed.to_pixels(posed.normalised_matrix(np.zeros(8))))
+    assert abs((posed.matrix(np.zeros(8)) * scene.F).sum()) == pytest.approx(1.0)
+    assert np.linalg.norm(posed.base) == pytest.approx(1.0)
+    same = [fundamental_problem(scene.x1, scene.x2, chart="F32=1", estimate=each) for each in (None, scene.F)]
+    np.testing.assert_array_equal(same[0].problem.A, same[1].problem.A)
+    with pytest.raises(ValueError, match="estimate must not be zero"):
+        fundamental_problem(scene.x1, scene.x2, estimate=np.zeros((3, 3)))
+
+
 def test_the_result_is_of_rank_two_in_pixels_with_its_distances():
     scene = synthetic_two_view(80, 0.3, np.random.default_rng(13))
-    found = find_fundamental(scene.x1, scene.x2, 0.05, method="peel", rng=3)
+    found = find_fundamental(scene.x1, scene.x2, 0.05, method="peel", rng=3, pixels=None)
     s = np.linalg.svd(found.F, compute_uv=False)
     assert s[2] < 1e-12 * s[0]
     assert np.linalg.norm(found.F) == pytest.approx(1.0)
@@ -218,8 +230,8 @@ def test_the_result_is_of_rank_two_in_pixels_with_its_distances():
 
 def test_a_refit_fits_the_inliers_better_in_the_mean():
     scene = synthetic_two_view(100, 0.3, np.random.default_rng(14))
-    first = find_fundamental(scene.x1, scene.x2, 0.03, method="peel")
-    second = find_fundamental(scene.x1, scene.x2, 0.03, method="peel", refit=True)
+    first = find_fundamental(scene.x1, scene.x2, 0.03, method="peel", pixels=None)
+    second = find_fundamental(scene.x1, scene.x2, 0.03, method="peel", refit=True, pixels=None)
     np.testing.assert_array_equal(first.inlier_mask, second.inlier_mask)
     inlier = first.inlier_mask & scene.inlier_mask
     assert np.linalg.norm(second.sampson[inlier]) < np.linalg.norm(first.sampson[inlier])
@@ -238,6 +250,9 @@ def test_a_refit_fits_the_inliers_better_in_the_mean():
         ({"chart": ["auto"]}, ValueError, "chart must be one of"),
         ({"threshold": 0.0}, ValueError, "threshold must be a positive finite number"),
         ({"samples": 0}, ValueError, "samples must be at least 1"),
+        ({"pixels": -1.0}, ValueError, "pixels must be a positive finite number, but it is -1.0"),
+        ({"pixels": "1"}, TypeError, "pixels must be a number"),
+        ({"time_limit": 0}, ValueError, "time_limit must be a positive number of seconds or None, but it is 0"),
         ({"rng": "seed"}, TypeError, "rng must be an integer"),
         ({"method": "luck"}, ValueError, "method must be .*one of"),
         ({"depth": 3}, TypeError, "unknown option 'depth'"),
@@ -253,7 +268,14 @@ def test_errors_name_the_argument(change, error, message):
 def test_what_is_frozen_stays_so():
     scene = synthetic_two_view(20, 0.0, np.random.default_rng(0))
     found = find_fundamental(scene.x1, scene.x2, 0.1, method="ransac")
-    for array in (found.F, found.problem.T1, found.problem.base, found.problem.directions, found.problem.problem.A):
+    for array in (
+        found.F,
+        found.F_linear,
+        found.problem.T1,
+        found.problem.base,
+        found.problem.directions,
+        found.problem.problem.A,
+    ):
         with pytest.raises(ValueError, match="read-only"):
             array[0] = 0.0
     with pytest.raises(AttributeError):

@@ -31,6 +31,9 @@ _CHARTS = ("auto", "F32=1", "F33=1")
 #: `maxcon.vision.fundamental.USUAL_THRESHOLD`, here for the same reason.
 _THRESHOLD = 0.01
 
+#: Of the polish, as in `maxcon.find_fundamental`.
+_PIXELS = 1.0
+
 
 @dataclass(frozen=True, eq=False)
 class Pair:
@@ -61,6 +64,14 @@ class Pair:
     show_default=True,
     help="How the scale of F is fixed: near a robust estimate, or by an entry of it that is made 1.",
 )
+@click.option(
+    "--pixels",
+    type=float,
+    default=_PIXELS,
+    show_default=True,
+    metavar="P",
+    help="Polish F to have many matches within so many pixels (Sampson); 0 leaves it as the consensus has it.",
+)
 @search_options
 @click.option(
     "--certificate",
@@ -86,6 +97,7 @@ def command(
     files: tuple[str, ...],
     threshold: float,
     chart: str,
+    pixels: float,
     method: str,
     refine: str,
     seed: int,
@@ -102,14 +114,15 @@ def command(
     """Fit the fundamental matrix of IMAGE1 and IMAGE2, despite the wrong ones among their matches.
 
     The images are matched by SIFT (nearest descriptors by the ratio test, mutual), the matches normalised, and
-    the linearised F is found that explains as many of them as possible within the threshold; F is brought to
-    rank 2 at the end. One MATLAB file PAIR.mat (a struct "data" with matches.X1 and matches.X2, as the authors of
-    A*-NAPA-DIBP published) stands for matches and images.
+    the linearised F is found that explains as many of them as possible within the threshold: the consensus, with
+    its bound. From there F is brought to rank 2 and polished, to have as many matches as local optimisation finds
+    within --pixels; no bound holds for these. One MATLAB file PAIR.mat (a struct "data" with matches.X1 and
+    matches.X2, as the authors of A*-NAPA-DIBP published) stands for matches and images.
 
-    The JSON object holds the files, the chart, F (3x3, pixels, [x2, 1] F [x1, 1] = 0), the matches x1 and x2 and
-    their Sampson distances in pixels, a note where the inliers do not determine F (of one plane, or the camera has
-    only turned), else null, and every field of maxcon.Consensus; model, residuals and threshold there are
-    those of the linear problem.
+    The JSON object holds the files, the chart, F (3x3, pixels, [x2, 1] F [x1, 1] = 0), F_linear (before the
+    polish), the matches x1 and x2, their Sampson distances from F in pixels, which of them are within --pixels, a
+    note where the inliers do not determine F (of one plane, or the camera has only turned), else null, and every
+    field of maxcon.Consensus; model, residuals, inlier_mask and threshold are those of the linear problem.
 
     \b
     Examples:
@@ -137,7 +150,15 @@ def command(
         found = _fit(
             pair,
             threshold,
-            {"chart": chart, "method": method, "rng": seed, "time_limit": time_limit, "refine": refiner, "gap": gap}
+            {
+                "chart": chart,
+                "pixels": pixels or None,
+                "method": method,
+                "rng": seed,
+                "time_limit": time_limit,
+                "refine": refiner,
+                "gap": gap,
+            }
             | {"certify": certify or certificate is not None}
             | chosen,
         )
@@ -212,6 +233,9 @@ def pair_table(pair: Pair, found: FundamentalFit, refine: str | None, notes: lis
         table.add_row("note", Text(found.degeneracy.note, style="yellow"))
     if np.isfinite(found.F).all():
         table.add_row("Sampson", f"median {number(found.median_sampson)} pixels (inliers, F of rank 2)")
+        if found.pixels is not None:
+            near = np.count_nonzero(found.within())
+            table.add_row("polished", f"{near} of {N} ({near / N:.1%}) within {found.pixels:g} px of F (Sampson)")
         rows = ["  ".join(f"{value:12.5e}" for value in row) for row in found.F]
         table.add_row("F (pixels)", Text("\n".join(rows)))
     else:
@@ -237,6 +261,9 @@ def _json(pair: Pair, found: FundamentalFit) -> bytes:
         "files": list(pair.names),
         "chart": found.chart,
         "F": found.F,
+        "F_linear": found.F_linear,
+        "pixels": found.pixels,
+        "within_pixels": None if found.pixels is None else found.within(),
         "median_sampson": found.median_sampson,
         "note": found.degeneracy.note,
         "x1": pair.x1,

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import math
+from typing import Any
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from maxcon.problem.validate import check_array
+from maxcon.problem.validate import check_array, check_number
 
 
 def check_points(value: ArrayLike, name: str) -> NDArray[np.float64]:
@@ -42,6 +45,14 @@ def check_matrix(value: ArrayLike, name: str = "F") -> NDArray[np.float64]:
     if not F.any():
         raise ValueError(f"{name} must not be zero, but all of its entries are")
     return F
+
+
+def check_pixels(value: Any) -> float:
+    """Return a threshold in pixels as a float; TypeError or ValueError if it is no positive finite number."""
+    pixels = check_number(value, "pixels")
+    if not (pixels > 0 and math.isfinite(pixels)):
+        raise ValueError(f"pixels must be a positive finite number, but it is {pixels}")
+    return pixels
 
 
 def sampson_distances(F: ArrayLike, x1: ArrayLike, x2: ArrayLike) -> NDArray[np.float64]:

@@ -127,6 +127,7 @@ def fundamental_problem(
     threshold: float = USUAL_THRESHOLD,
     rng: int | np.random.Generator | None = None,
     samples: int = SAMPLES,
+    estimate: ArrayLike | None = None,
 ) -> FundamentalProblem:
     """Pose the fundamental matrix of matches as a problem with linear residuals (paper, section 4.2).
 
@@ -144,7 +145,7 @@ def fundamental_problem(
     - "auto": f = f0 + Q theta with a robust estimate f0 of unit norm (see `maxcon.vision.estimate`) and an
       orthonormal basis Q of the directions orthogonal to it. theta = 0 is the estimate, and near it the residual
       is that of an f of unit norm: no F is badly placed if the estimate is not. f0 depends on the threshold and
-      on `rng`.
+      on `rng`, or is given as `estimate`.
 
     The chart is a part of the question: at the same threshold, another chart asks for another consensus, since
     it scales f otherwise. As ``|f| >= 1`` in each chart, residuals are never less than those of f scaled to unit
@@ -162,6 +163,9 @@ def fundamental_problem(
         A seed or a NumPy generator, for the estimate behind "auto"; None stands for the seed 0.
     samples
         How many random samples the estimate behind "auto" draws at most, at least 1; it stops at a confidence of 99%.
+    estimate
+        A matrix in pixels, shape (3, 3), that the chart "auto" is rotated to; None: it is estimated. Other charts
+        ignore it.
 
     Raises
     ------
@@ -176,7 +180,10 @@ def fundamental_problem(
     one = CHARTS[chart]
     if one is None:
         scale, samples = check_threshold(threshold), check_count(samples, "samples", 1)
-        base = robust_estimate(rows, scale, _generator(rng), samples)
+        if estimate is None:
+            base = robust_estimate(rows, scale, check_generator(rng), samples)
+        else:
+            base = _unit(np.linalg.solve(T2.T, check_matrix(estimate, "estimate")) @ np.linalg.inv(T1))
         directions = orthogonal_directions(base)
         problem = LinearProblem(rows @ directions, -(rows @ base))
     else:
@@ -201,7 +208,15 @@ def orthogonal_directions(base: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.ascontiguousarray(np.delete(reflection, axis, axis=1))
 
 
-def _generator(rng: Any) -> np.random.Generator:
+def _unit(F: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the entries of a matrix at unit norm, shape (9,), the largest of them positive."""
+    f = F.ravel() / np.linalg.norm(F)
+    unit: NDArray[np.float64] = f * np.sign(f[np.argmax(np.abs(f))])
+    return unit
+
+
+def check_generator(rng: Any) -> np.random.Generator:
+    """Return a NumPy generator from one, a seed or None (the seed 0); TypeError or ValueError otherwise."""
     if isinstance(rng, np.random.Generator):
         return rng
     if rng is None:
