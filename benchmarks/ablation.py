@@ -45,7 +45,7 @@ from maxcon.experiments.search_instances import FAMILIES, Ranges, draw_problem, 
 from maxcon.experiments.self_imitation import Learner, Recipe, Recorder, best_known, train_search_networks  # noqa: E402
 from maxcon.search.anytime import make_task  # noqa: E402
 from maxcon.search.learned import learned  # noqa: E402
-from maxcon.search.learned_kernels import Settings  # noqa: E402
+from maxcon.search.learned_settings import Settings  # noqa: E402
 
 CELLS = (
     "hyperplane:100:0.75",

@@ -23,7 +23,7 @@ walk those of its set), d the number of parameters, n = d + 1.
     change, coefficients, inverse, refinement of a basis     n^2; n^2; 2 n^3; n d
     a weighted fit: weights, weighted rows, equations        N (d (d + 1) / 2 + 2 d + 2) + d^3 / 3
     a least-squares fit of m points                          m (d (d + 1) / 2 + d) + d^3 / 3
-    point k of a minimal sample; the model of one            k d - k (k - 1) / 2 + d - k; d^2 / 2
+    the model of a minimal sample                            d^3 / 3 + d^2
     score of a model; its vote                               3 N; N, 2 N where it is the best so far
     the point network, the peel network for one point        N times, once the number of weights
     sizes, ranks, leverages, weights of the draw             6 N; 2 N; N d; 2 N
@@ -66,14 +66,14 @@ from maxcon.search.belief import MOST_LACK, TEMPERATURES  # noqa: E402
 from maxcon.search.belief_proposals import MANY  # noqa: E402
 from maxcon.search.learned_kernels import (  # noqa: E402
     WALK_INCUMBENT,
-    Settings,
     begin_search,
     begin_search_above,
     finish_search,
+    play_coarse_round,
     play_parts,
-    play_rounds,
 )
 from maxcon.search.learned_memory import N_COUNTS, ROUND, SIZE, allocate_arena  # noqa: E402
+from maxcon.search.learned_settings import Settings  # noqa: E402
 from maxcon.search.random_kernels import seed_state  # noqa: E402
 
 #: The parts of a round, in the order of `maxcon.search.learned_kernels.play`.
@@ -127,7 +127,7 @@ def play_fit(problem: LinearProblem, threshold: float, rounds: int, log: Log) ->
             log(f"its walk{level}", int(counts[SIZE]))
         if size < N:
             while counts[ROUND] < method.COARSE_ROUNDS and not (counts[ROUND] > 0 and method._agrees(counts)):
-                play_rounds(arena, task.limit, settings._replace(variations=0), 1)
+                play_coarse_round(arena, task.limit, settings)
             log(f"rounds until it agrees{level}", int(counts[SIZE]))
         coarse = arena
     if len(sizes) > 1:
@@ -183,6 +183,11 @@ def _eliminate(At: NDArray[np.float64], b: Any, point: int, rank: int, *rest: An
     return float(rank * d - rank * (rank - 1) / 2.0 + (d - rank))
 
 
+def _lanes(At: NDArray[np.float64], b: Any, count: int, lanes: Any) -> float:
+    d = At.shape[0]
+    return count * (d**3 / 3.0 + d * d)
+
+
 #: Module, function, multiply-adds of a call, and whether it calls no other kernel: then it may be compiled on its own.
 COUNTED: tuple[tuple[str, str, Callable[..., float], bool], ...] = (
     ("minimax.linear", "_subtract_product", _columns, True),
@@ -192,13 +197,15 @@ COUNTED: tuple[tuple[str, str, Callable[..., float], bool], ...] = (
     ("minimax.simplex", "pivot", lambda C, w, leave: w.shape[0] ** 2.0, True),
     ("minimax.simplex", "coefficients", lambda C, g, w: w.shape[0] ** 2.0, True),
     ("minimax.simplex", "invert", lambda G, C: 2.0 * C.shape[0] ** 3, True),
-    ("minimax.rows", "dot", lambda x, y: x.shape[0], True),
+    ("minimax.sums", "dot", lambda x, y: x.shape[0], True),
+    ("minimax.sums", "total_of", lambda x: 0.0, True),  # counted by those who call it
     ("search.model_kernels", "weighted_model", _weighted, False),
     ("search.model_kernels", "solve_normal_equations", lambda table, x: x.shape[0] ** 3 / 3.0, True),
     ("search.model_kernels", "least_squares_model", _least_squares, False),
     ("search.model_kernels", "eliminate_point", _eliminate, True),
     ("search.model_kernels", "substitute_back", lambda rank, *rest: 0.5 * rank * rank, True),
-    ("search.belief", "nearness", lambda r, *rest: 3.0 * r.shape[0], True),
+    ("search.belief", "nearness", lambda r, *rest: 3.0 * r.shape[0], False),
+    ("search.lane_kernels", "solve_lanes", _lanes, False),
     ("search.belief", "cast_vote", _vote, False),
     ("search.belief_proposals", "accumulate_weights", lambda p, *rest: 2.0 * p.shape[0], True),
     ("search.belief", "update_belief", lambda net, number, belief: 5.0 * belief.p.shape[0], False),
@@ -234,7 +241,8 @@ def install_counters() -> None:
     modules = [module for name, module in list(sys.modules.items()) if name.startswith("maxcon.")]
     for home, name, multiply_adds, alone in COUNTED:
         original = getattr(sys.modules[f"maxcon.{home}"], name)
-        inner = numba.njit(error_model="numpy")(original) if alone else original
+        liberties = {"reassoc"} if home == "minimax.sums" else False  # as `sum_kernel`
+        inner = numba.njit(error_model="numpy", fastmath=liberties)(original) if alone else original
         wrapped = counted(inner, multiply_adds, quiet=name == "_whiten")
         for module in modules:
             if getattr(module, name, None) is original:

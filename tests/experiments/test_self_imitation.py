@@ -20,7 +20,7 @@ from maxcon.experiments.self_imitation import (
     train_search_networks,
 )
 from maxcon.search.anytime import make_task
-from maxcon.search.learned_kernels import check_settings
+from maxcon.search.learned_settings import check_settings
 
 torch = pytest.importorskip("torch")
 

@@ -7,9 +7,9 @@ from maxcon.agent.search_networks import shipped_search_networks
 from maxcon.datasets.synthetic import synthetic_hyperplane
 from maxcon.search.anytime import make_task
 from maxcon.search.belief import MOST_LACK, MOST_LOGIT, TEMPERATURES, agreement, cast_vote, forget_votes, nearness
-from maxcon.search.learned_kernels import Settings as RoundSettings
 from maxcon.search.learned_kernels import begin_search, play_rounds
 from maxcon.search.learned_memory import allocate_arena, carve
+from maxcon.search.learned_settings import Settings as RoundSettings
 from maxcon.search.random_kernels import seed_state
 
 

@@ -31,7 +31,6 @@ from maxcon.search.learned import learned
 from maxcon.search.learned_kernels import (
     PARTS,
     WALK_INCUMBENT,
-    Settings,
     begin_search,
     begin_search_above,
     finish_search,
@@ -39,6 +38,7 @@ from maxcon.search.learned_kernels import (
     play_rounds,
 )
 from maxcon.search.learned_memory import FLAGS_USED, FLOATS_USED, INTEGERS_USED, N_COUNTS, SIZE, allocate_arena, carve
+from maxcon.search.learned_settings import Settings
 from maxcon.search.random_kernels import seed_state
 from maxcon.search.refine import swap_refinement
 

@@ -39,12 +39,12 @@ from maxcon.search.learned_kernels import (
     PROPOSE,
     SWAP,
     WALK,
-    Settings,
     begin_search,
     finish_search,
     play_parts,
 )
 from maxcon.search.learned_memory import ROUND, STEPS, WALKS, Search, allocate_arena, carve
+from maxcon.search.learned_settings import Settings
 from maxcon.search.random_kernels import seed_state
 from maxcon.search.refine import swap_refinement
 from maxcon.search.sampling import lo_ransac

@@ -23,13 +23,11 @@ from maxcon.search.belief_proposals import MANY
 from maxcon.search.learned_kernels import (
     PARTS,
     WALK_INCUMBENT,
-    Settings,
     begin_search,
     begin_search_above,
-    check_settings,
     finish_search,
+    play_coarse_round,
     play_parts,
-    play_rounds,
     read_belief,
 )
 from maxcon.search.learned_memory import (
@@ -43,6 +41,7 @@ from maxcon.search.learned_memory import (
     Arena,
     allocate_arena,
 )
+from maxcon.search.learned_settings import Settings, check_settings
 from maxcon.search.random_kernels import seed_state
 from maxcon.search.sampling import check_count
 
@@ -199,7 +198,7 @@ def _root(task: Task, nets: SearchNetworks, settings: Settings) -> tuple[Arena, 
     least = max(COARSE, COARSE_RANKS * task.rows.At.shape[0])
     while sizes[-1] > max(MANY, 2 * least):
         sizes.append(max(sizes[-1] // COARSER, least))
-    began, left, brief, coarse, walk = working_clock(), task.seconds_left(), settings._replace(variations=0), None, 0.0
+    began, left, coarse, walk = working_clock(), task.seconds_left(), None, 0.0
     for size in reversed(sizes):
         rows = task.rows if size == N else _some(task.rows, task.rng.choice(N, size, replace=False))
         arena = allocate_arena(rows, seed_state(task.rng), nets.points, nets.peel)
@@ -216,7 +215,7 @@ def _root(task: Task, nets: SearchNetworks, settings: Settings) -> tuple[Arena, 
         while size < N and counts[ROUND] < COARSE_ROUNDS and not (counts[ROUND] > 0 and _agrees(counts)):
             if (coarse is not None or counts[ROUND] > 0) and working_clock() - began > COARSE_SHARE * left:
                 break
-            play_rounds(arena, task.limit, brief, 1)
+            play_coarse_round(arena, task.limit, settings)
         coarse = arena
     return arena, walk
 
