@@ -23,7 +23,8 @@ import maxcon  # noqa: E402
 from maxcon.datasets.synthetic import THRESHOLD, synthetic_hyperplane  # noqa: E402
 from maxcon.minimax import Workspace, allocate, linear_rows  # noqa: E402
 from maxcon.minimax.jit import kernel  # noqa: E402
-from maxcon.minimax.linear import cold_fit, refit_after_removal  # noqa: E402
+from maxcon.minimax.linear import cold_fit  # noqa: E402
+from maxcon.minimax.refits import refit_after_removal  # noqa: E402
 
 INSTANCES = 30
 REPEATS = 15

@@ -37,7 +37,8 @@ from scipy.optimize import linprog  # noqa: E402
 
 from maxcon.datasets.synthetic import synthetic_hyperplane  # noqa: E402
 from maxcon.minimax import Workspace, allocate, linear_rows, minimax_fit  # noqa: E402
-from maxcon.minimax.linear import basis_points, cold_fit, refit_after_removal  # noqa: E402
+from maxcon.minimax.linear import basis_points, cold_fit  # noqa: E402
+from maxcon.minimax.refits import refit_after_removal  # noqa: E402
 from maxcon.problem import LinearProblem  # noqa: E402
 
 CELLS = [(N, d) for d in (2, 3, 8) for N in (100, 200, 500, 1000)]

@@ -192,7 +192,7 @@ def _lanes(At: NDArray[np.float64], b: Any, count: int, lanes: Any) -> float:
 COUNTED: tuple[tuple[str, str, Callable[..., float], bool], ...] = (
     ("minimax.linear", "_subtract_product", _columns, True),
     ("minimax.linear", "_most_violated", lambda r, *rest: r.shape[0], True),
-    ("minimax.linear", "_relax", lambda At, *rest: 5.0 * At.shape[1], False),
+    ("minimax.linear", "relax_row", lambda At, *rest: 5.0 * At.shape[1], False),
     ("minimax.linear", "refine_vertex", lambda At, b, gain, cap, C, x, *rest: x.shape[0] * (x.shape[0] - 1.0), False),
     ("minimax.simplex", "pivot", lambda C, w, leave: w.shape[0] ** 2.0, True),
     ("minimax.simplex", "coefficients", lambda C, g, w: w.shape[0] ** 2.0, True),

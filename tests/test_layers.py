@@ -25,6 +25,7 @@ LAYERS = [
     "estimators",
     "experiments",
     "cli",
+    "__main__",
 ]
 
 HEAVY = {"torch", "gymnasium", "sklearn", "cv2", "matplotlib", "tensorboard", "trimesh", "skimage"}

@@ -12,14 +12,8 @@ from numba import config
 
 import instances
 from maxcon.minimax import allocate, linear_rows, minimax_fit
-from maxcon.minimax.linear import (
-    OK,
-    basis_points,
-    cold_fit,
-    refit_after_addition,
-    refit_after_enforcement,
-    refit_after_removal,
-)
+from maxcon.minimax.linear import OK, basis_points, cold_fit
+from maxcon.minimax.refits import refit_after_addition, refit_after_enforcement, refit_after_removal
 from maxcon.problem import LinearProblem
 
 NAMES = ["random_instance", "quantised", "repeated_column", "duplicate_rows", "years", "far_outliers", "minimal"]

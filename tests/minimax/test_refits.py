@@ -76,6 +76,21 @@ def test_removing_a_point_twice_changes_nothing(name):
         assert walk.value == pytest.approx(value, rel=1e-12, abs=1e-12 * np.abs(walk.b).max())
 
 
+@pytest.mark.parametrize("name", NAMES)
+def test_removals_together(name):
+    """Of the basis, and of others with it, down to nothing but a few."""
+    walk, rng = start(name, 125)
+    while len(walk.kept) > walk.A.shape[1] + 4:
+        basis = walk.basis or walk.kept[:1].tolist()
+        chosen = [int(i) for i in rng.permutation(basis)[: rng.integers(1, len(basis) + 1)]]
+        others = np.setdiff1d(walk.kept, chosen)
+        chosen += [int(i) for i in rng.permutation(others)[: rng.integers(0, 3)]]
+        before = walk.value
+        assert walk.remove_all(chosen[: len(walk.kept) - 1]) == OK
+        assert walk.value <= before + 1e-12 * np.abs(walk.b).max() + walk.rounding()
+        walk.check()
+
+
 # -------------------------------------------------------------------------------------------------- addition
 
 

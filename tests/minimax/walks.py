@@ -9,15 +9,12 @@ import numpy as np
 import instances
 import oracles
 from maxcon.minimax import Workspace, allocate, linear_rows
-from maxcon.minimax.linear import (
-    FAILED,
-    INFEASIBLE,
-    OK,
-    basis_points,
-    cold_fit,
+from maxcon.minimax.linear import FAILED, INFEASIBLE, OK, basis_points, cold_fit
+from maxcon.minimax.refits import (
     refit_after_addition,
     refit_after_enforcement,
     refit_after_removal,
+    refit_after_removals,
 )
 from maxcon.problem import LinearProblem
 
@@ -68,6 +65,11 @@ class Walk:
     def remove(self, point: int) -> int:
         self.status = refit_after_removal(*self.workspace, point)
         self.free[point] = self.enforced[point] = False
+        return self.status
+
+    def remove_all(self, points: list[int]) -> int:
+        self.status = refit_after_removals(*self.workspace, np.array([*points, -1]), len(points))
+        self.free[points] = self.enforced[points] = False
         return self.status
 
     def add(self, point: int, stop_above: float = math.inf) -> int:

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from instances import BUILDERS
+from instances import BUILDERS, synthetic
 from maxcon.agent.search_networks import shipped_search_networks
 from maxcon.minimax import allocate, minimax_fit
 from maxcon.minimax.linear import OK, cold_fit
@@ -11,7 +11,7 @@ from maxcon.problem import LinearProblem
 from maxcon.search.anytime import make_task
 from maxcon.search.learned_kernels import begin_search
 from maxcon.search.learned_memory import allocate_arena, carve
-from maxcon.search.peel_walk import choose_start, install_walk, walk_down
+from maxcon.search.peel_walk import ONE_OF, choose_start, install_walk, walk_down
 from maxcon.search.random_kernels import seed_state
 
 
@@ -26,7 +26,8 @@ def walked(A, b, threshold, reach=np.inf, explore=0.0, log_steps=40, seed=0, loy
     start = search.walk.points[:m].copy()
     kept = np.zeros(0, dtype=bool) if not loyal else search.member
     args = (task.rows.At, task.rows.b, task.limit, nets.peel, m, r, 0.5, explore, kept, search.belief)
-    status, removed = walk_down(*args, search.scratch.state, search.walk)
+    status, removed, steps = walk_down(*args, search.scratch.state, search.walk)
+    assert steps <= removed <= (1 + m // ONE_OF) * steps
     return task, search, start, status, removed
 
 
@@ -93,6 +94,22 @@ def test_a_loyal_walk_keeps_the_incumbent(name):
         install_walk(search.ws, len(start), search.walk)
         assert (search.ws.gain == 1.0)[search.member].all()
         assert removed + search.member.sum() <= len(start)
+
+
+@pytest.mark.parametrize("loyal", [False, True])
+def test_of_many_points_several_are_removed_in_a_step(loyal):
+    A, b = synthetic(np.random.default_rng(3), 3 * ONE_OF, 3, 0.2)
+    task, search, start, status, removed = walked(A, b, 0.1, reach=1.5, loyal=loyal)
+    assert status == OK
+    assert len(start) > 2 * ONE_OF
+    install_walk(search.ws, len(start), search.walk)
+    kept = search.ws.gain == 1.0
+    assert kept.sum() == len(start) - removed
+    assert minimax_fit(task.problem, kept).value <= 0.1 * (1 + 1e-8)
+    if loyal:
+        assert kept[search.member].all()
+    steps = np.count_nonzero(search.walk.log[:, 0, 0])
+    assert 1.5 * steps < removed
 
 
 def test_exploring_walks_are_seeded():

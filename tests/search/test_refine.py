@@ -5,7 +5,8 @@ import pytest
 
 from instances import BUILDERS, synthetic
 from maxcon.minimax import allocate, minimax_fit
-from maxcon.minimax.linear import OK, cold_fit, refit_after_enforcement
+from maxcon.minimax.linear import OK, cold_fit
+from maxcon.minimax.refits import refit_after_enforcement
 from maxcon.problem import LinearProblem
 from maxcon.search.anytime import Task, make_task
 from maxcon.search.refine import swap_refinement, tree_refinement

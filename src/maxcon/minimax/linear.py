@@ -1,4 +1,4 @@
-"""Kernels of the minimax fit for linear residuals: cold, and warm after a point is removed, added or enforced.
+"""Kernels of the minimax fit for linear residuals: cold, and what the warm re-fits (`refits`) are made of.
 
 Every point i has a mode, two numbers: its residual must be at most ``gain[i] * gamma + cap[i]``.
 In the minimax fit: gain 1, cap 0. Removed: gain 0, cap infinite. Enforced within a threshold: gain 0, cap = threshold.
@@ -311,7 +311,7 @@ def dual_simplex(
 
 
 @kernel
-def _relax(
+def relax_row(
     At: NDArray[np.float64],
     gain: NDArray[np.float64],
     cap: NDArray[np.float64],
@@ -432,14 +432,14 @@ def cold_fit(
                 start(C, x, q)
         status = dual_simplex(At, b, gain, cap, C, x, q, r, work, table, np.inf, attempt > 0)
         if status == OK:
-            status = _settle(At, b, gain, cap, C, x, q, r, work, table)
+            status = settle(At, b, gain, cap, C, x, q, r, work, table)
         if status != FAILED:
             return status
     return status
 
 
 @kernel
-def _settle(
+def settle(
     At: NDArray[np.float64],
     b: NDArray[np.float64],
     gain: NDArray[np.float64],
@@ -463,143 +463,12 @@ def _settle(
         if relax < 0:
             return OK
         for count in range(20 * n + 100):
-            if _relax(At, gain, cap, C, x, q, r, work, table, relax, False) != OK:
+            if relax_row(At, gain, cap, C, x, q, r, work, table, relax, False) != OK:
                 return FAILED
             relax = row_to_relax(C, q, count > 4 * n + 8)
             if relax < 0:
                 break
     return FAILED
-
-
-@kernel
-def refit_after_removal(
-    At: NDArray[np.float64],
-    b: NDArray[np.float64],
-    gain: NDArray[np.float64],
-    cap: NDArray[np.float64],
-    C: NDArray[np.float64],
-    x: NDArray[np.float64],
-    q: NDArray[np.int64],
-    r: NDArray[np.float64],
-    work: NDArray[np.float64],
-    table: NDArray[np.float64],
-    point: int,
-) -> int:
-    """Remove `point` (its mode is set here) and move from the vertex to the fit of the rest."""
-    n = x.shape[0]
-    gain[point] = 0.0
-    cap[point] = np.inf
-    status = OK
-    for k in range(n):
-        if q[k] >= 0 and q[k] >> 1 == point:
-            status = _relax(At, gain, cap, C, x, q, r, work, table, k, True)
-            if status != OK:
-                break
-    if status == OK:
-        for count in range(20 * n + 100):
-            relax = row_to_relax(C, q, count > 4 * n + 8)
-            if relax < 0:
-                break
-            status = _relax(At, gain, cap, C, x, q, r, work, table, relax, False)
-            if status != OK:
-                break
-    if status == OK:
-        status = _settle(At, b, gain, cap, C, x, q, r, work, table)
-    if status != OK:
-        status = cold_fit(At, b, gain, cap, C, x, q, r, work, table)
-    return status
-
-
-@kernel
-def refit_after_addition(
-    At: NDArray[np.float64],
-    b: NDArray[np.float64],
-    gain: NDArray[np.float64],
-    cap: NDArray[np.float64],
-    C: NDArray[np.float64],
-    x: NDArray[np.float64],
-    q: NDArray[np.int64],
-    r: NDArray[np.float64],
-    work: NDArray[np.float64],
-    table: NDArray[np.float64],
-    point: int,
-    stop_above: float,
-) -> int:
-    """Add `point` to the fit (its mode is set here); STOPPED as soon as gamma is proven above `stop_above`.
-
-    After STOPPED the vertex belongs to no state: the caller restores the one that it had.
-    """
-    if gain[point] == 0.0 and cap[point] < np.inf:  # enforced so far: its row, if tight, would change its meaning
-        status = refit_after_removal(At, b, gain, cap, C, x, q, r, work, table, point)
-        if status != OK:
-            return status
-    gain[point] = 1.0
-    cap[point] = 0.0
-    if abs(r[point]) <= x[x.shape[0] - 1]:
-        return OK
-    status = dual_simplex(At, b, gain, cap, C, x, q, r, work, table, stop_above, False)
-    if status == OK:
-        status = _settle(At, b, gain, cap, C, x, q, r, work, table)
-    if status == FAILED:
-        status = cold_fit(At, b, gain, cap, C, x, q, r, work, table)
-    return status
-
-
-@kernel
-def refit_after_enforcement(
-    At: NDArray[np.float64],
-    b: NDArray[np.float64],
-    gain: NDArray[np.float64],
-    cap: NDArray[np.float64],
-    C: NDArray[np.float64],
-    x: NDArray[np.float64],
-    q: NDArray[np.int64],
-    r: NDArray[np.float64],
-    work: NDArray[np.float64],
-    table: NDArray[np.float64],
-    point: int,
-    threshold: float,
-) -> int:
-    """Demand that the residual of `point` is at most `threshold` from now on (its mode is set here).
-
-    INFEASIBLE where no model keeps all enforced points within their thresholds.
-    """
-    n = x.shape[0]
-    was_free = gain[point] == 1.0
-    gain[point] = 0.0
-    cap[point] = threshold
-    status = OK
-    sides = 0
-    drifted = False
-    for k in range(n):
-        if q[k] >= 0 and q[k] >> 1 == point and was_free:
-            # The row loses its gamma: g' = g - e_n, a change of rank one in G and so in C. Not so where both sides
-            # of the point are tight: without gamma they are one row.
-            multiplier = C[n - 1, k]
-            sides += 1
-            if sides == 2 or 1.0 - multiplier < 1e-7:
-                status = FAILED
-                break
-            for m in range(n):
-                table[n, m] = C[n - 1, m] / (1.0 - multiplier)
-            for j in range(n):
-                c = C[j, k]
-                for m in range(n):
-                    C[j, m] += c * table[n, m]
-            # x moves along that row's column of C, on which no other basis row changes, to the new residual.
-            gap = (1.0 - 2.0 * (q[k] & 1)) * r[point] - threshold
-            for j in range(n):
-                x[j] += gap * C[j, k]
-            drifted = multiplier > 0.9  # and so C grew tenfold, rounding with it
-    if sides == 1 and status == OK and not refine_vertex(At, b, gain, cap, C, x, q, table, drifted):
-        status = FAILED
-    if status == OK:
-        status = dual_simplex(At, b, gain, cap, C, x, q, r, work, table, np.inf, False)
-    if status == OK:
-        status = _settle(At, b, gain, cap, C, x, q, r, work, table)
-    if status == FAILED:
-        status = cold_fit(At, b, gain, cap, C, x, q, r, work, table)
-    return status
 
 
 #: Only a row whose multiplier is above this holds the fit in place: removing its point lowers f(S).

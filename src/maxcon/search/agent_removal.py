@@ -12,7 +12,8 @@ from maxcon.agent.inference import Agent, Parameters, Scratch, q_values
 from maxcon.agent.shipped import agent_file, shipped_agent
 from maxcon.minimax import Workspace, allocate
 from maxcon.minimax.jit import kernel
-from maxcon.minimax.linear import OK, basis_multipliers, basis_points, cold_fit, refit_after_removal
+from maxcon.minimax.linear import OK, basis_multipliers, basis_points, cold_fit
+from maxcon.minimax.refits import refit_after_removal
 from maxcon.problem.validate import check_number
 from maxcon.search.anytime import Step, Task
 from maxcon.tree.encoding import encode_channels

@@ -70,10 +70,11 @@ COARSE_RANKS = 20
 
 #: A walk takes about the number of points to this power. A root's last walk is worth more than all before it: one that
 #: would pass the time limit is begun if it passes it by no more than half of what has been spent.
-WALK_GROWTH, OVERRUN = 1.5, 0.5
+WALK_GROWTH, OVERRUN = 1.8, 0.5
 
-#: Of many points, the first incumbent is swapped at once where there is so much of the time left that it took.
-SWAP_FIRST = 0.6
+#: Of many points, the first incumbent is swapped at once where there is so much of the time left that it took, and so
+#: many times as much as its walk takes.
+SWAP_FIRST, SWAP_WALKS = 0.6, 3.0
 
 #: Until a round has been timed: what it takes, in times of the root.
 ROUND_ROOTS = 1.6
@@ -166,8 +167,9 @@ def _search(
             reported, spoken = int(counts[SIZE]), working_clock()
         if walk < end - now + OVERRUN * (now - began):
             play_parts(arena, limit, settings, WALK_INCUMBENT, WALK_INCUMBENT + 1)
+            walk = working_clock() - now
         now = working_clock()
-        if end - now > SWAP_FIRST * (now - began):
+        if end - now > max(SWAP_FIRST * (now - began), SWAP_WALKS * walk):
             finish_search(arena, limit)
             now = working_clock()
     for number in cycle(range(len(pieces))):

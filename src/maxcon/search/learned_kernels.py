@@ -151,7 +151,7 @@ def walk_from(search: Search, limit: float, settings: Settings, x: NDArray[np.fl
     m = choose_start(r, settings.reach * limit, walk.points)
     if m + FEW_MORE < counts[SIZE]:
         return
-    status, removed = walk_down(
+    status, removed, steps = walk_down(
         ws.At,
         ws.b,
         limit,
@@ -166,7 +166,7 @@ def walk_from(search: Search, limit: float, settings: Settings, x: NDArray[np.fl
         walk,
     )
     counts[WALKS] += 1
-    counts[STEPS] = removed
+    counts[STEPS] = steps
     if status != OK:
         return
     install_walk(ws, m, walk)

@@ -29,7 +29,7 @@ from maxcon.search.vertex_kernels import VertexCopies
 MEMORY = 16
 
 #: Places in `Search.counts`: the size of the incumbent, the number of the round, rounds without progress, whether the
-#: incumbent has been swapped, whether its vertex is kept, walks made, removals of the last walk, whether the
+#: incumbent has been swapped, whether its vertex is kept, walks made, steps of the last walk, whether the
 #: incumbent has been walked from, how much of each block `carve` uses, the mean belief in the incumbent's points in
 #: thousandths, and the number of points outside the incumbent that are believed in.
 SIZE, ROUND, STALL, SWAPPED, PLACED, WALKS, STEPS, WALKED = 0, 1, 2, 3, 4, 5, 6, 7

@@ -15,15 +15,8 @@ from maxcon.agent.peel_features import write_peel_features
 from maxcon.agent.perceptron import Perceptron, evaluate_row
 from maxcon.minimax import Workspace
 from maxcon.minimax.jit import kernel
-from maxcon.minimax.linear import (
-    FAILED,
-    OK,
-    basis_multipliers,
-    basis_points,
-    cold_fit,
-    compute_residuals,
-    refit_after_removal,
-)
+from maxcon.minimax.linear import FAILED, OK, basis_multipliers, basis_points, cold_fit, compute_residuals
+from maxcon.minimax.refits import refit_after_removals
 from maxcon.search.belief import Belief
 from maxcon.search.random_kernels import random_below, random_unit
 
@@ -64,6 +57,10 @@ class Walk(NamedTuple):
     hidden: NDArray[np.float64]
     log: NDArray[np.float64]
     log_basis: NDArray[np.int64]
+
+
+#: So many points more, one basis point more is removed in a step.
+ONE_OF = 2000
 
 
 @kernel
@@ -119,8 +116,11 @@ def walk_down(
     belief: Belief,
     state: NDArray[np.int64],
     walk: Walk,
-) -> tuple[int, int]:
+) -> tuple[int, int, int]:
     """Remove basis points from the set ``walk.points[:m]`` until it is feasible.
+
+    Of many points several are removed in a step, as the network ranks them: what that costs comes back when points are
+    added to the end of the walk.
 
     Parameters
     ----------
@@ -138,20 +138,21 @@ def walk_down(
 
     Returns
     -------
-    OK, or FAILED where a fit did; and how many points were removed. The vertex reached is in ``walk.C``,
+    OK, or FAILED where a fit did; how many points were removed, in how many steps. The vertex reached is in ``walk.C``,
     ``walk.x``, ``walk.q`` (named by places in ``walk.points``) with ``walk.gain[:m]`` 1 for the points kept.
     """
     wAt, wb, gain, cap, C, x, q, r, work, table = _copy_rows(At, b, m, walk)
     points, basis, named, multipliers, sides = walk.points, walk.basis, walk.named, walk.multipliers, walk.sides
     features, hidden, logit, known = walk.features, walk.hidden, belief.logit, belief.features
     n = x.shape[0]
+    several = 1 + m // ONE_OF
     if m == 0 or cold_fit(wAt, wb, gain, cap, C, x, q, r, work, table) != OK:
-        return FAILED, 0
-    removed = 0
+        return FAILED, 0, 0
+    removed = steps = 0
     while x[n - 1] > limit:
         size = basis_points(C, q, basis)
         if size == 0:
-            return FAILED, removed
+            return FAILED, removed, steps
         basis_multipliers(C, q, basis, multipliers)
         for slot in range(size):
             sides[slot] = 1.0 if r[basis[slot]] >= 0.0 else -1.0
@@ -171,37 +172,50 @@ def walk_down(
             known,
             features,
         )
-        if removed < walk.log.shape[0]:
-            _keep_log(features, named, size, walk.log[removed], walk.log_basis[removed])
-        slot = _best_row(net, features, named, size, kept, hidden)
+        if steps < walk.log.shape[0]:
+            _keep_log(features, named, size, walk.log[steps], walk.log_basis[steps])
+        count = _best_rows(net, features, named, size, kept, hidden, several, multipliers, basis)
         if explore > 0.0 and random_unit(state) < explore:
             slot = random_below(state, size)
-        if refit_after_removal(wAt, wb, gain, cap, C, x, q, r, work, table, basis[slot]) != OK:
-            return FAILED, removed
-        removed += 1
-    return OK, removed
+            basis[0], basis[slot] = basis[slot], basis[0]
+        if refit_after_removals(wAt, wb, gain, cap, C, x, q, r, work, table, basis, count) != OK:
+            return FAILED, removed, steps
+        removed += count
+        steps += 1
+    return OK, removed, steps
 
 
 @kernel
-def _best_row(
+def _best_rows(
     net: Perceptron,
     features: NDArray[np.float64],
     named: NDArray[np.int64],
     size: int,
     kept: NDArray[np.bool_],
     hidden: NDArray[np.float64],
+    several: int,
+    logits: NDArray[np.float64],
+    basis: NDArray[np.int64],
 ) -> int:
-    """Return which of the first `size` rows, but for points that are kept, has the largest logit."""
-    best = 0
-    most = -np.inf
+    """Move the points with the largest logits to the front of ``basis[:size]``; return how many, at most `several`.
+
+    Points that are kept come last; one at least is in front. `logits` is scratch space.
+    """
+    free = 0
     for slot in range(size):
-        if kept.shape[0] > 0 and kept[named[slot]]:
-            continue
-        value = evaluate_row(net, features[slot], hidden)
-        if value > most:
-            most = value
-            best = slot
-    return best
+        logits[slot] = -np.inf
+        if kept.shape[0] == 0 or not kept[named[slot]]:
+            logits[slot] = evaluate_row(net, features[slot], hidden)
+            free += 1
+    count = max(min(several, free), 1)
+    for place in range(count):
+        best = place
+        for slot in range(place + 1, size):
+            if logits[slot] > logits[best]:
+                best = slot
+        logits[place], logits[best] = logits[best], logits[place]
+        basis[place], basis[best] = basis[best], basis[place]
+    return count
 
 
 @kernel

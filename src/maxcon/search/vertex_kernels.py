@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from maxcon.minimax import LinearRows, Workspace
 from maxcon.minimax.jit import kernel
-from maxcon.minimax.linear import refit_after_addition, refit_after_removal
+from maxcon.minimax.refits import refit_after_addition, refit_after_removal
 
 
 class VertexCopies(NamedTuple):

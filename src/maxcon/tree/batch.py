@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 
 from maxcon.minimax import linear_rows
 from maxcon.minimax.jit import kernel
-from maxcon.minimax.linear import OK, basis_multipliers, basis_points, cold_fit, refit_after_removal
+from maxcon.minimax.linear import OK, basis_multipliers, basis_points, cold_fit
+from maxcon.minimax.refits import refit_after_removal
 from maxcon.problem import LinearProblem
 
 

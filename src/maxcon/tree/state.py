@@ -8,7 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from maxcon.minimax import Workspace, allocate, linear_rows
-from maxcon.minimax.linear import OK, basis_multipliers, basis_points, cold_fit, refit_after_removal
+from maxcon.minimax.linear import OK, basis_multipliers, basis_points, cold_fit
+from maxcon.minimax.refits import refit_after_removal
 from maxcon.problem import LinearProblem, check_threshold, inlier_slack
 from maxcon.tree.encoding import PAPER_CHANNELS, channel_flags, encode_channels, raw_features
 
