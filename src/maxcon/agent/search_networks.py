@@ -13,8 +13,8 @@ from maxcon.agent.perceptron import Perceptron, load_perceptrons, save_perceptro
 from maxcon.agent.point_features import N_POINT_FEATURES
 
 #: Inputs, hidden widths and output of the two networks as trained by this package.
-POINT_WIDTHS = (N_POINT_FEATURES, 16, 16, 1)
-PEEL_WIDTHS = (N_PEEL_FEATURES, 8, 1)
+POINT_WIDTHS = (N_POINT_FEATURES, 24, 24, 1)
+PEEL_WIDTHS = (N_PEEL_FEATURES, 16, 16, 1)
 
 _SHIPPED = Path(str(resources.files("maxcon.agent"))) / "shipped_search" / "search.safetensors"
 

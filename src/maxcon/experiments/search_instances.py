@@ -41,7 +41,7 @@ class Ranges:
     rates: tuple[float, float] = (0.3, 0.9)
     high_rates: tuple[float, float] = (0.3, 0.8)
     few: tuple[int, int] = (50, 200)
-    many: tuple[int, int] = (200, 1000)
+    many: tuple[int, int] = (200, 600)
 
 
 def make_problem(
