@@ -11,7 +11,7 @@ from maxcon.minimax.jit import kernel
 from maxcon.minimax.linear import compute_residuals
 from maxcon.search.belief import RAW, SHARP, SHRINK, SOFT, Belief, cast_vote, nearness
 from maxcon.search.gnc_kernels import descend, local_start
-from maxcon.search.lane_kernels import LANES, Lanes, solve_lanes
+from maxcon.search.lane_kernels import LANES, solve_lanes
 from maxcon.search.model_kernels import count_within, eliminate_point, substitute_back
 from maxcon.search.random_kernels import draw_next, random_unit
 from maxcon.search.sampling_kernels import Scratch
@@ -36,8 +36,6 @@ class Proposals(NamedTuple):
         Shapes (KEPT, r) and (KEPT,): best first; scores are soft counts of points.
     cumulative, guide
         Shape (N,): running sums of the weights of the draw, and where to begin to look among them.
-    lanes
-        Samples side by side.
     few_rows, few_b, few_r
         Shapes (r, m), (m,), (m,): the random points that samples are ranked on, m = 0 where all are.
     best
@@ -48,7 +46,6 @@ class Proposals(NamedTuple):
     scores: NDArray[np.float64]
     cumulative: NDArray[np.float64]
     guide: NDArray[np.int64]
-    lanes: Lanes
     few_rows: NDArray[np.float64]
     few_b: NDArray[np.float64]
     few_r: NDArray[np.float64]
@@ -197,7 +194,7 @@ def propose(
     state, table, places = scratch.state, scratch.table, scratch.places
     votes, totals, tops = belief.votes, belief.totals, belief.tops
     models, scores, cumulative, guide = proposals.models, proposals.scores, proposals.cumulative, proposals.guide
-    few_rows, few_b, few_r, lanes = proposals.few_rows, proposals.few_b, proposals.few_r, proposals.lanes
+    few_rows, few_b, few_r, lanes = proposals.few_rows, proposals.few_b, proposals.few_r, scratch.lanes
     few = few_b.shape[0] > 0
     accumulate_weights(belief.p, power, floor, cumulative, guide)
     for k in range(KEPT):
@@ -269,6 +266,8 @@ def refine_proposals(
         scratch.weighted[:m],
         scratch.table,
         scratch.places,
+        scratch.lanes,
+        scratch.lane,
     )
     for k in range(count):
         for j in range(d):

@@ -125,7 +125,7 @@ def allocate_arena(
         + 2 * BLOCK * int(point_net.widths.max()) + 2 * int(peel_net.widths.max())
         + n * N_PEEL_FEATURES * (1 + log_steps)
     )  # fmt: skip
-    integers = N_COUNTS + (10 + 2 * n) * N + 9 * n + d + BINS + log_steps * n + d * LANES
+    integers = N_COUNTS + (10 + 2 * n) * N + 9 * n + d + BINS + log_steps * n + d * LANES + 2
     return Arena(
         rows.At,
         rows.b,
@@ -219,7 +219,13 @@ def carve(arena: Arena) -> Search:
     weighted, f = _cut(F, f, N)
     small, f = _cut2(F, f, d, d + 1)
     places, k = _cut(K, k, d)
-    scratch = Scratch(state, pool, inliers, near, model, other, residuals, w, weighted, small, places)
+    lane_points, k = _cut2(K, k, d, LANES)
+    lane_table, f = _cut3(F, f, d, d + 1, LANES)
+    lane_models, f = _cut2(F, f, d, LANES)
+    good, g = _cut(B, g, LANES)
+    lanes = Lanes(lane_points, lane_table, lane_models, good)
+    lane, k = _cut(K, k, 2)
+    scratch = Scratch(state, pool, inliers, near, model, other, residuals, w, weighted, small, places, lanes, lane)
 
     features, f = _cut2(F, f, N_POINT_FEATURES, N)
     votes, f = _cut2(F, f, 3, N)
@@ -235,16 +241,11 @@ def carve(arena: Arena) -> Search:
     scores, f = _cut(F, f, KEPT)
     cumulative, f = _cut(F, f, N)
     guide, k = _cut(K, k, N)
-    lane_points, k = _cut2(K, k, d, LANES)
-    lane_table, f = _cut3(F, f, d, d + 1, LANES)
-    lane_models, f = _cut2(F, f, d, LANES)
-    good, g = _cut(B, g, LANES)
-    lanes = Lanes(lane_points, lane_table, lane_models, good)
     few_rows, f = _cut2(F, f, d, few)
     few_b, f = _cut(F, f, few)
     few_r, f = _cut(F, f, few)
     best, f = _cut(F, f, d)
-    proposals = Proposals(models, scores, cumulative, guide, lanes, few_rows, few_b, few_r, best)
+    proposals = Proposals(models, scores, cumulative, guide, few_rows, few_b, few_r, best)
 
     points, k = _cut(K, k, N)
     walk_At, f = _cut(F, f, d * N)

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from maxcon.minimax.jit import kernel
 from maxcon.minimax.linear import compute_residuals
+from maxcon.search.lane_kernels import LANES, Lanes, allocate_lanes, solve_lanes
 from maxcon.search.model_kernels import (
     count_within,
     least_squares_model,
@@ -22,6 +23,9 @@ from maxcon.search.model_kernels import (
     weighted_model,
 )
 from maxcon.search.random_kernels import draw_next
+
+#: Where samples begin, few are made at once: easy problems need no more.
+FIRST_LANES = 8
 
 
 class Scratch(NamedTuple):
@@ -39,6 +43,10 @@ class Scratch(NamedTuple):
         Shape (N,): residuals, weights, and weights times a column.
     table, places
         Shapes (r, r + 1) and (r,): what a model is eliminated in.
+    lanes
+        Samples side by side.
+    lane
+        Shape (2,): the next of them to be looked at, and how many there are.
     """
 
     state: NDArray[np.int64]
@@ -52,6 +60,8 @@ class Scratch(NamedTuple):
     weighted: NDArray[np.float64]
     table: NDArray[np.float64]
     places: NDArray[np.int64]
+    lanes: Lanes
+    lane: NDArray[np.int64]
 
 
 def allocate_scratch(At: NDArray[np.float64], state: NDArray[np.int64]) -> Scratch:
@@ -69,7 +79,28 @@ def allocate_scratch(At: NDArray[np.float64], state: NDArray[np.int64]) -> Scrat
         weighted=np.zeros(N),
         table=np.zeros((d, d + 1)),
         places=np.zeros(d, dtype=np.int64),
+        lanes=allocate_lanes(d),
+        lane=np.zeros(2, dtype=np.int64),
     )
+
+
+@kernel
+def next_model(At: NDArray[np.float64], b: NDArray[np.float64], scratch: Scratch, x: NDArray[np.float64]) -> None:
+    """Write into x the model of the next random minimal sample; they are made in batches, each twice as large."""
+    lanes, lane, state, pool = scratch.lanes, scratch.lane, scratch.state, scratch.pool
+    if lane[0] == lane[1]:
+        lane[0], lane[1] = 0, min(max(2 * lane[1], FIRST_LANES), LANES)
+        for number in range(lane[1]):
+            for k in range(x.shape[0]):
+                lanes.points[k, number] = draw_next(state, pool, k, pool.shape[0])
+        solve_lanes(At, b, lane[1], lanes)
+    number = lane[0]
+    lane[0] += 1
+    if lanes.good[number]:
+        for j in range(x.shape[0]):
+            x[j] = lanes.models[j, number]
+    else:
+        minimal_model(At, b, pool, pool.shape[0], state, scratch.table, scratch.places, x)
 
 
 @kernel
@@ -204,7 +235,7 @@ def sample(
     for drawn in range(first, last):
         if drawn >= needed:
             return size, drawn, True
-        minimal_model(At, b, scratch.pool, N, scratch.state, scratch.table, scratch.places, x)
+        next_model(At, b, scratch, x)
         count = score(At, b, x, limit, size, scratch.r)
         if count > size:
             size = count
