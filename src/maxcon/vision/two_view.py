@@ -25,7 +25,14 @@ from maxcon.vision.epipolar import (
     symmetric_epipolar_distances,
 )
 from maxcon.vision.estimate import smallest_directions
-from maxcon.vision.fundamental import LEAST_MATCHES, SAMPLES, FundamentalProblem, check_generator, fundamental_problem
+from maxcon.vision.fundamental import (
+    LEAST_MATCHES,
+    SAMPLES,
+    USUAL_THRESHOLD,
+    FundamentalProblem,
+    check_generator,
+    fundamental_problem,
+)
 from maxcon.vision.polish import Polish
 
 #: What the search has of a time limit that posing the problem has used up, in seconds.
@@ -121,7 +128,7 @@ class FundamentalFit:
 def find_fundamental(
     x1: ArrayLike,
     x2: ArrayLike,
-    threshold: float,
+    threshold: float = USUAL_THRESHOLD,
     *,
     chart: str = "auto",
     method: str = "auto",
@@ -149,7 +156,8 @@ def find_fundamental(
         Shape (N, 2) each, N >= 9, in pixels: ``x1[i]`` of image 1 is matched to ``x2[i]`` of image 2.
     threshold
         The largest residual of an inlier: algebraic, in normalised coordinates, without a unit. The paper
-        takes 0.1 for made scenes and 0.01 for KITTI. What it means in pixels depends on the images; `sampson` tells.
+        takes 0.1 for made scenes and 0.01, the default, for KITTI. What it means in pixels depends on the images;
+        `sampson` tells.
     chart
         How the scale of F is fixed, and with it the residual: "auto", "F32=1" or "F33=1".
     method, time_limit, refine, gap, callback, **options
