@@ -16,6 +16,8 @@ from maxcon.datasets.synthetic import synthetic_hyperplane
 from maxcon.minimax.jit import compile_seconds, working_clock
 from maxcon.search.anytime import Progress, Step, make_task, run
 from maxcon.search.conclusion import conclude
+from maxcon.search.milp import milp
+from maxcon.search.witness import make_witness
 from oracles import default_slack, highs_minimax
 
 METHODS = tuple(maxcon.methods())
@@ -259,6 +261,16 @@ def test_loading_kernels_does_not_count_either():
     taken = compile_seconds() - before
     assert 0.1 <= taken <= time.perf_counter() - began
     assert working_clock() - clock <= time.perf_counter() - began - taken + 1e-3
+
+
+def test_methods_with_a_look_of_their_own_at_the_clock_count_no_compiling():
+    """As if an hour of compiling had passed since the deadline was set."""
+    problem = synthetic_hyperplane(np.random.default_rng(0), 40, 0.2, 2)
+    mask = maxcon.fit(problem, 0.1, method="ransac").inlier_mask
+    task = make_task(problem, 0.1, np.random.default_rng(0), time_limit=60.0)
+    late = dataclasses.replace(task, deadline=time.perf_counter() - 1.0, compiled=compile_seconds() - 3600.0)
+    assert make_witness(late, mask).upper_bound == make_witness(task, mask).upper_bound < 39
+    assert run(late, milp(late)).gap == 0
 
 
 @pytest.mark.skipif(config.DISABLE_JIT, reason="no kernel is compiled")

@@ -236,6 +236,9 @@ def test_it_tells_what_it_believes():
         learned(task, belief=np.zeros(99))
     with pytest.raises(ValueError, match=r"belief must be an array of shape \(100,\)"):
         learned(task, belief=np.zeros(100, dtype=np.float32))
+    belief.setflags(write=False)
+    with pytest.raises(ValueError, match="type float64 that can be written to"):
+        learned(task, belief=belief)
 
 
 def test_bad_options_are_named(tmp_path):

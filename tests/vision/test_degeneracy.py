@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from maxcon.vision import find_fundamental, match_images, read_image
+from maxcon.vision.degeneracy import degeneracy
 from real_data import real_data
 
 K = np.array([[700.0, 0.0, 600.0], [0.0, 700.0, 200.0], [0.0, 0.0, 1.0]])
@@ -52,6 +53,25 @@ def test_the_same_image(chart):
     found = find_fundamental(x, x, threshold=0.01, chart=chart)
     assert (found.degeneracy.n_inliers, found.degeneracy.on_homography, found.degeneracy.null_space) == (50, 50, 3)
     assert "they do not determine F" in found.degeneracy.note
+
+
+def test_a_matrix_far_from_the_inliers_makes_no_homography_of_them():
+    """Nor is one without numbers of any account."""
+    rng = np.random.default_rng(0)
+    found = find_fundamental(*views(room(200, rng), STEP, 0.5, rng), threshold=0.01)
+    far = np.array([[0.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 300.0]])  # rows of one image 300 pixels off
+    assert degeneracy(found.problem, found.inlier_mask, [far]).note is not None
+    for matrices in ([far, found.F_linear], [np.full((3, 3), np.nan), found.F]):
+        judged = degeneracy(found.problem, found.inlier_mask, matrices)
+        assert judged.note is None
+        assert judged.on_homography < 0.5 * found.n_inliers
+
+
+def test_the_same_image_without_a_matrix():
+    """Where nothing of rank 2 was met there are no distances to judge by."""
+    x = np.random.default_rng(0).uniform(0, 1000, (50, 2))
+    found = find_fundamental(x, x, threshold=0.01)
+    assert degeneracy(found.problem, found.inlier_mask, [np.full((3, 3), np.nan)]).on_homography == 50
 
 
 def test_few_different_matches():

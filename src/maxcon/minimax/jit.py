@@ -9,7 +9,7 @@ import time
 from collections.abc import Callable
 from functools import cache
 from pathlib import Path
-from threading import get_ident
+from threading import RLock, get_ident
 from typing import Any, TypeVar, cast
 
 import numba
@@ -57,7 +57,7 @@ def sum_kernel(function: F) -> F:
 
     In order, one addition waits for the one before. Reordered they fill a vector register, three times as fast (LLVM's
     "reassoc", without the other liberties of "fastmath": infinities and NaNs stay what they are). The last bits then
-    hang on the width of the machine's registers.
+    hang on the width of the machine's registers: equal results of equal seeds are promised on one kind of machine only.
     """
     return _compiled(function, {"reassoc"})
 
@@ -97,24 +97,28 @@ class _Making(event.Listener):  # type: ignore[misc]
     def __init__(self) -> None:
         self._threads: list[int] = []  # those at it, or waiting for one that is; once for each kernel in another
         self._since = 0.0
+        self._lock = RLock()  # numba notes the end after it has let go of its own lock
 
     def on_start(self, event: Any) -> None:
-        if not self._threads:
-            self._since = time.perf_counter()
-        self._threads.append(get_ident())
+        with self._lock:
+            if not self._threads:
+                self._since = time.perf_counter()
+            self._threads.append(get_ident())
 
     def on_end(self, event: Any) -> None:
-        if get_ident() in self._threads:
-            self._threads.remove(get_ident())
-            if not self._threads:
-                self.seconds += time.perf_counter() - self._since
+        with self._lock:
+            if get_ident() in self._threads:
+                self._threads.remove(get_ident())
+                if not self._threads:
+                    self.seconds += time.perf_counter() - self._since
 
     def so_far(self) -> float:
         """Return the seconds of all kernels, with the one that another thread may be at."""
-        # A thread that asks is at no kernel: Ctrl-C has met it while it waited for the lock, and it got no end.
-        while get_ident() in self._threads:
-            self._threads.remove(get_ident())
-        return self.seconds + (time.perf_counter() - self._since if self._threads else 0.0)
+        with self._lock:
+            # A thread that asks is at no kernel: Ctrl-C has met it while it waited for the lock, and it got no end.
+            while get_ident() in self._threads:
+                self._threads.remove(get_ident())
+            return self.seconds + (time.perf_counter() - self._since if self._threads else 0.0)
 
 
 _making = _Making()

@@ -35,8 +35,8 @@ class Task:
     rng
         The only source of random numbers.
     deadline
-        ``time.perf_counter()`` at which to stop, or infinity. The loop stops a method between steps; a method
-        need look at it only to size a long step.
+        ``time.perf_counter()`` at which to stop, or infinity; ask `over` and `seconds_left`, which know what does not
+        count. The loop stops a method between steps; a method need look at it only to size a long step.
     gap
         The gap at which the search may stop.
     compiled

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from maxcon.minimax.jit import kernel
 
-#: Samples side by side. Their equations, with eight parameters 36 KB, stay in the nearest cache.
+#: Samples side by side. Their equations, with eight parameters 36 KB, stay in the near caches.
 LANES = 64
 
 #: A pivot below this is small: whitened rows have entries of order 1.

@@ -143,9 +143,12 @@ def learned(
         rounds = check_count(rounds, "rounds", 1)
     N = task.problem.n_points
     if belief is not None and not (
-        isinstance(belief, np.ndarray) and belief.shape == (N,) and belief.dtype == np.float64
+        isinstance(belief, np.ndarray)
+        and belief.shape == (N,)
+        and belief.dtype == np.float64
+        and belief.flags.writeable
     ):
-        raise ValueError(f"belief must be an array of shape ({N},) and type float64 to write to")
+        raise ValueError(f"belief must be an array of shape ({N},) and type float64 that can be written to")
     return _search(task, nets, rounds, Settings() if settings is None else check_settings(settings), belief)
 
 

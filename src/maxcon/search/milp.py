@@ -108,7 +108,7 @@ def _steps(task: Task, given: tuple[Floats, Floats] | None, node_limit: int | No
     while True:
         began = time.perf_counter()
         if task.deadline < np.inf:
-            seconds = task.deadline - began
+            seconds = task.seconds_left()
             if seconds <= 0.0:
                 return
         answer = programme.solve(seconds, node_limit)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Iterator
 from typing import Literal
 
@@ -103,7 +102,7 @@ def peel_improve(task: Task, subset: NDArray[np.bool_]) -> NDArray[np.bool_]:
     for step in _rounds(task, subset, REACH):
         if step.subset is not None:
             best = step.subset
-        if time.perf_counter() >= task.deadline:
+        if task.over():
             break
     return best
 

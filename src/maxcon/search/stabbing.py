@@ -47,8 +47,9 @@ from maxcon.search.stabbing_kernels import (
 from maxcon.search.stabbing_prism import BOX_SIZE, CENTRE, HALF, WINDOW, Prism, inliers
 from maxcon.search.stabbing_rows import SAMPLES, Strips, dependent_rows, make_strips, stabbing_column
 
-#: Points in prisms between two steps: some 5 ms.
-BUDGET = 500_000
+#: Points in prisms between two steps: some 5 ms. Where there is a time limit the first step is so much shorter, and
+#: none is longer than what is left of the time by what the one before took.
+BUDGET, SHORTER = 500_000, 20
 
 #: Memory for nodes, at first and at most: 150 bytes each.
 FIRST_NODES, MOST_NODES = 2_048, 262_144
@@ -58,6 +59,9 @@ FIRST_LISTS, MOST_LISTS = (16, 32_768), (32, 16_777_216)
 
 #: Bins of one stabbing at most: these stay in the nearest cache.
 MOST_BINS = 4_096
+
+#: But no step is shorter than this, some 10 us.
+LEAST_BUDGET = 1_000
 
 #: How many minimax fits may go into the decision about a prism that splitting does not decide.
 FITS = 256
@@ -166,8 +170,14 @@ class _Search:
         dependence = self.k if len(everything) and not dependent_rows(self.strips, everything, self.k) else 0
         shown = 0
         reason = TIRED
+        left = self.task.seconds_left()
+        budget = BUDGET if left == np.inf else BUDGET // SHORTER
         while reason != PROVEN:
-            reason = advance(self.strips, self.prism, self.tree, _FACES[self.k], dependence, BUDGET, self.task.gap)
+            reason = advance(self.strips, self.prism, self.tree, _FACES[self.k], dependence, budget, self.task.gap)
+            if left < np.inf:
+                before, left = left, self.task.seconds_left()
+                fits = budget * max(left, 0.0) / max(before - left, 1e-9)
+                budget = max(LEAST_BUDGET, int(min(fits, 2.0 * budget, BUDGET)))
             if reason == NODES_FULL:
                 self._grow_nodes()
                 continue

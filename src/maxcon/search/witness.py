@@ -14,7 +14,6 @@ other proof needs; where there are none it is merged with another part, as long 
 
 from __future__ import annotations
 
-import time
 from collections.abc import Generator, Iterator
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -130,7 +129,7 @@ def make_witness(
     target = n_outliers if enough is None else n_points - enough
     maker = _Maker(task, residuals, target, max(LEAST_BASES, n_outliers) if max_bases is None else max_bases)
     for _ in maker.steps():
-        if time.perf_counter() >= task.deadline:
+        if task.over():
             break
     groups = tuple(group for part in maker.parts.values() for group in part.groups)
     return Witness(groups, n_points - maker.needed)

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
+from maxcon.vision.epipolar import sampson_distances
 from maxcon.vision.fundamental import FundamentalProblem
 
 #: From this share of the inliers on, one homography that explains them is worth a note.
@@ -63,7 +65,9 @@ class Degeneracy:
         return None
 
 
-def degeneracy(posed: FundamentalProblem, inlier_mask: NDArray[np.bool_], error: float) -> Degeneracy:
+def degeneracy(
+    posed: FundamentalProblem, inlier_mask: NDArray[np.bool_], matrices: Iterable[NDArray[np.float64]]
+) -> Degeneracy:
     """Find out how well the inliers determine F.
 
     Parameters
@@ -72,8 +76,10 @@ def degeneracy(posed: FundamentalProblem, inlier_mask: NDArray[np.bool_], error:
         The problem.
     inlier_mask
         Shape (N,), bool.
-    error
-        The median Sampson distance of the inliers in pixels, a measure of the errors of their coordinates.
+    matrices
+        Fits of F, shape (3, 3) each, in pixels; those with NaN are passed over. The smallest of the inliers' median
+        Sampson distances from them is taken as a measure of the errors of their coordinates: a matrix that is polished
+        for other matches may be far from most inliers, and then any homography would do.
 
     Notes
     -----
@@ -83,14 +89,15 @@ def degeneracy(posed: FundamentalProblem, inlier_mask: NDArray[np.bool_], error:
     A, b = posed.problem.A[inlier_mask], posed.problem.b[inlier_mask]
     if len(A) <= 8:
         return Degeneracy(len(A), 9 - len(A), 0)
-    rows = A @ posed.directions.T - np.outer(
-        b, posed.base
-    )  # back from the chart: the rows of the eight-point algorithm
+    # Back from the chart: the rows of the eight-point algorithm.
+    rows = A @ posed.directions.T - np.outer(b, posed.base)
     sizes = np.linalg.svd(rows, compute_uv=False)
     open_directions = int(np.count_nonzero(sizes <= RANK_TOLERANCE * sizes[0]))
     to, of = rows[:, [2, 5]], rows[:, [6, 7]]  # the normalised points of image 2 and image 1
-    limit = max(ERRORS * error * float(posed.T2[0, 0]), LEAST_ERROR * np.sqrt(2.0))
-    return Degeneracy(len(A), open_directions, _most_explained(of, to, limit))
+    x1, x2 = ((moved - T[:2, 2]) / T[0, 0] for T, moved in ((posed.T1, of), (posed.T2, to)))  # back to pixels
+    medians = [np.median(sampson_distances(F, x1, x2)) for F in matrices if np.isfinite(F).all()]
+    limit = max(ERRORS * min(medians, default=0.0) * posed.T2[0, 0], LEAST_ERROR * np.sqrt(2.0))
+    return Degeneracy(len(A), open_directions, _most_explained(of, to, float(limit)))
 
 
 def _most_explained(of: NDArray[np.float64], to: NDArray[np.float64], limit: float) -> int:

@@ -173,8 +173,7 @@ def fundamental_problem(
         If an argument is not of this kind, the points of an image coincide, or N < 9; the message names it.
     """
     first, second = check_matches(x1, x2, LEAST_MATCHES)
-    if not isinstance(chart, str) or chart not in CHARTS:
-        raise ValueError(f"chart must be one of {', '.join(map(repr, CHARTS))}, but it is {chart!r}")
+    check_chart(chart)
     T1, T2 = hartley_transform(first, "x1"), hartley_transform(second, "x2")
     rows = epipolar_rows(transformed(T1, first), transformed(T2, second))
     one = CHARTS[chart]
@@ -194,6 +193,12 @@ def fundamental_problem(
     for array in (T1, T2, base, directions):
         array.setflags(write=False)
     return FundamentalProblem(problem, chart, T1, T2, base, directions)
+
+
+def check_chart(chart: Any) -> None:
+    """Raise a ValueError if this is no chart."""
+    if not isinstance(chart, str) or chart not in CHARTS:
+        raise ValueError(f"chart must be one of {', '.join(map(repr, CHARTS))}, but it is {chart!r}")
 
 
 def orthogonal_directions(base: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -30,6 +30,7 @@ from maxcon.vision.fundamental import (
     SAMPLES,
     USUAL_THRESHOLD,
     FundamentalProblem,
+    check_chart,
     check_generator,
     fundamental_problem,
 )
@@ -119,7 +120,7 @@ class FundamentalFit:
     @cached_property
     def degeneracy(self) -> Degeneracy:
         """Whether the inliers determine F: its `note` says so where they do not. Found when it is first asked for."""
-        return degeneracy(self.problem, self.inlier_mask, self.median_sampson)
+        return degeneracy(self.problem, self.inlier_mask, (self.F, self.F_linear))
 
     def __repr__(self) -> str:
         return f"FundamentalFit(chart={self.chart!r}, {self.consensus!r})"
@@ -184,6 +185,7 @@ def find_fundamental(
         If an argument is not of this kind, the points of an image coincide, or N < 9; the message names it.
     """
     threshold = check_threshold(threshold)
+    check_chart(chart)  # at once, and not after the polish
     check_time_limit(time_limit)
     pixels = None if pixels is None else check_pixels(pixels)
     first, second = check_matches(x1, x2, LEAST_MATCHES)
