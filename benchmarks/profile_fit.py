@@ -68,6 +68,7 @@ from maxcon.search.learned_kernels import (  # noqa: E402
     WALK_INCUMBENT,
     begin_search,
     begin_search_above,
+    begin_search_belief,
     finish_search,
     play_coarse_round,
     play_parts,
@@ -125,6 +126,9 @@ def play_fit(problem: LinearProblem, threshold: float, rounds: int, log: Log) ->
             log(f"root above{level}", int(counts[SIZE]))
             play_parts(arena, task.limit, settings, WALK_INCUMBENT, WALK_INCUMBENT + 1)
             log(f"its walk{level}", int(counts[SIZE]))
+            if size < N:
+                begin_search_belief(arena, task.limit)
+                log(f"its belief{level}", int(counts[SIZE]))
         if size < N:
             while counts[ROUND] < method.COARSE_ROUNDS and not (counts[ROUND] > 0 and method._agrees(counts)):
                 play_coarse_round(arena, task.limit, settings)
@@ -133,6 +137,8 @@ def play_fit(problem: LinearProblem, threshold: float, rounds: int, log: Log) ->
     if len(sizes) > 1:
         finish_search(arena, task.limit)
         log("first swap", int(counts[SIZE]))
+        begin_search_belief(arena, task.limit)
+        log("first belief", int(counts[SIZE]))
     for number in range(rounds):
         for part, name in enumerate(PARTS):
             play_parts(arena, task.limit, settings, part, part + 1)

@@ -33,6 +33,7 @@ from maxcon.search.learned_kernels import (
     WALK_INCUMBENT,
     begin_search,
     begin_search_above,
+    begin_search_belief,
     finish_search,
     play_parts,
     play_rounds,
@@ -325,6 +326,10 @@ def test_a_search_above_takes_the_incumbent_of_the_one_below(afresh):
     begin_search_above(arena, task.limit, coarse, Settings(), afresh)
     play_parts(arena, task.limit, Settings(), WALK_INCUMBENT, WALK_INCUMBENT + 1)
     above, below = carve(arena), carve(coarse)
+    assert (above.belief.p == 0.5).all()
+    begin_search_belief(arena, task.limit)
+    assert above.belief.p[above.member].mean() > 0.8
+    assert above.belief.p[~above.member].mean() < 0.3
     assert above.member.sum() >= 320
     assert (above.l1 == below.l1).all() != afresh
     assert_feasible(task, above.member)

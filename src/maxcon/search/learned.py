@@ -25,6 +25,7 @@ from maxcon.search.learned_kernels import (
     WALK_INCUMBENT,
     begin_search,
     begin_search_above,
+    begin_search_belief,
     finish_search,
     play_coarse_round,
     play_parts,
@@ -82,6 +83,9 @@ ROUND_ROOTS = 1.6
 #: How much of a round's time must be left for the last swap to be made, and of what a piece of a round takes for
 #: another one: what is begun is finished, so that the time limit is passed by at most the rest of it.
 SWAP_ROUNDS, PIECE_FITS = 0.5, 0.6
+
+#: Of many points, the first belief and a round are begun where there is so many times what a piece of a round takes.
+BELIEF_PIECES = 2.0
 
 
 def learned(
@@ -175,6 +179,11 @@ def _search(
         if end - now > max(SWAP_FIRST * (now - began), SWAP_WALKS * walk):
             finish_search(arena, limit)
             now = working_clock()
+        if end - now <= BELIEF_PIECES * took[0]:
+            pieces = []
+        else:
+            begin_search_belief(arena, limit)
+            now = working_clock()
     for number in cycle(range(len(pieces))):
         if number == 0 and (counts[ROUND] >= rounds if rounds is not None else end == np.inf and _is_settled(counts)):
             break
@@ -217,6 +226,8 @@ def _root(task: Task, nets: SearchNetworks, settings: Settings) -> tuple[Arena, 
             if size < N and walk < left - (1.0 - OVERRUN) * (before - began):
                 play_parts(arena, task.limit, settings, WALK_INCUMBENT, WALK_INCUMBENT + 1)
                 walk = (working_clock() - before) * COARSER**WALK_GROWTH
+            if size < N:
+                begin_search_belief(arena, task.limit)
         while size < N and counts[ROUND] < COARSE_ROUNDS and not (counts[ROUND] > 0 and _agrees(counts)):
             if (coarse is not None or counts[ROUND] > 0) and working_clock() - began > COARSE_SHARE * left:
                 break

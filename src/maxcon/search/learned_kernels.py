@@ -105,14 +105,17 @@ def begin(search: Search, limit: float) -> None:
     root_models(search.ws.At, search.ws.b, limit, search.scratch, search.l1, search.gnc)
     for j in range(search.x.shape[0]):
         search.x[j] = search.gnc[j]
-    _begin_belief(search, limit)
+    take_model(search, limit)
+    search.counts[STALL] = 0
+    begin_belief(search, limit)
 
 
 @kernel
 def begin_above(search: Search, limit: float, coarse: Search, local: float, afresh: bool) -> None:
     """Do the root with what a search on some of the points has found: its incumbent moved to a local minimum.
 
-    The two models of all points are those of the coarse search, unless they are to be made `afresh`.
+    The two models of all points are those of the coarse search, unless they are to be made `afresh`. The first belief
+    (see `begin_belief`) is left to be made when a round is to be played: it takes as long as the rest.
     """
     _clear(search)
     ws, scratch = search.ws, search.scratch
@@ -126,15 +129,15 @@ def begin_above(search: Search, limit: float, coarse: Search, local: float, afre
         search.x[j] = search.gnc[j]
         scratch.x[j] = coarse.x[j]
     descend(ws.At, ws.b, limit, local * local, SHRINK, 1000, scratch, scratch.x, search.x, size)
-    _begin_belief(search, limit)
+    take_model(search, limit)
+    search.counts[STALL] = 0
 
 
 @kernel
-def _begin_belief(search: Search, limit: float) -> None:
-    ws, scratch = search.ws, search.scratch
-    start_belief(ws.At, ws.b, limit, scratch, search.l1, search.gnc, search.belief)
-    take_model(search, limit)
-    search.counts[STALL] = 0
+def begin_belief(search: Search, limit: float) -> None:
+    """Make the first belief, from the two models of all points and the incumbent."""
+    ws = search.ws
+    start_belief(ws.At, ws.b, limit, search.scratch, search.l1, search.gnc, search.belief)
     update_belief(search.point_net, 0, search.belief)
 
 
@@ -358,6 +361,12 @@ def begin_search(arena: Arena, limit: float) -> None:
 def begin_search_above(arena: Arena, limit: float, coarse: Arena, settings: Settings, afresh: bool) -> None:
     """Do the root from what a search on some of the points has found; see `begin_above`."""
     begin_above(carve(arena), limit, carve(coarse), settings.local, afresh)
+
+
+@kernel
+def begin_search_belief(arena: Arena, limit: float) -> None:
+    """Make the first belief of a search that was begun from one on some of the points."""
+    begin_belief(carve(arena), limit)
 
 
 @kernel
