@@ -226,20 +226,20 @@ def test_its_sets_are_refined():
 def test_it_tells_what_it_believes():
     A, b = synthetic(np.random.default_rng(3), 100, 8, 0.3)
     belief = np.full(100, np.nan)
-    best = run(task := task_for(A, b, 0.1), learned(task, belief=belief))
+    best = run(task := task_for(A, b, 0.1), learned(task, belief_out=belief))
     assert ((belief > 0) & (belief < 1)).all()
     assert np.array_equal(belief > 0.5, best.subset)
     other = np.full(100, np.nan)
-    again = run(task := task_for(A, b, 0.1), learned(task, belief=other))
+    again = run(task := task_for(A, b, 0.1), learned(task, belief_out=other))
     assert np.array_equal(best.subset, again.subset)
     assert np.array_equal(belief, other)
-    with pytest.raises(ValueError, match=r"belief must be an array of shape \(100,\)"):
-        learned(task, belief=np.zeros(99))
-    with pytest.raises(ValueError, match=r"belief must be an array of shape \(100,\)"):
-        learned(task, belief=np.zeros(100, dtype=np.float32))
+    with pytest.raises(ValueError, match=r"belief_out must be an array of shape \(100,\)"):
+        learned(task, belief_out=np.zeros(99))
+    with pytest.raises(ValueError, match=r"belief_out must be an array of shape \(100,\)"):
+        learned(task, belief_out=np.zeros(100, dtype=np.float32))
     belief.setflags(write=False)
     with pytest.raises(ValueError, match="type float64 that can be written to"):
-        learned(task, belief=belief)
+        learned(task, belief_out=belief)
 
 
 def test_bad_options_are_named(tmp_path):

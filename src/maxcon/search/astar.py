@@ -278,7 +278,7 @@ def _begin_with(task: Task, search: Search, subset: NDArray[np.bool_]) -> None:
 def _learn(task: Task, search: Search) -> Iterator[Step]:
     """Let the search know the set of the learned search, and its belief."""
     best, belief = np.zeros(task.problem.n_points, dtype=np.bool_), search.scratch.doubt
-    for step in learned_search(replace(task, deadline=np.inf), belief=belief):  # so that it ends by itself
+    for step in learned_search(replace(task, deadline=np.inf), belief_out=belief):  # so that it ends by itself
         if step.subset is not None:
             best = step.subset
         yield step

@@ -94,7 +94,7 @@ def learned(
     network: str | Path | SearchNetworks | None = None,
     rounds: int | None = None,
     settings: Settings | None = None,
-    belief: NDArray[np.float64] | None = None,
+    belief_out: NDArray[np.float64] | None = None,
 ) -> Iterator[Step]:
     """Search with the learned agent: propose, walk down the tree, believe, swap; again and again.
 
@@ -120,8 +120,8 @@ def learned(
         half), else 24 and at least as many as the progress took.
     settings
         The settings of a round; None for the defaults.
-    belief
-        Shape (N,), float64: is told, when the search has ended by itself, with what probability each point is an
+    belief_out
+        Shape (N,), float64: is told, when the search has ended, with what probability each point is an
         inlier of the best set.
 
     Yields
@@ -146,18 +146,18 @@ def learned(
     if rounds is not None:
         rounds = check_count(rounds, "rounds", 1)
     N = task.problem.n_points
-    if belief is not None and not (
-        isinstance(belief, np.ndarray)
-        and belief.shape == (N,)
-        and belief.dtype == np.float64
-        and belief.flags.writeable
+    if belief_out is not None and not (
+        isinstance(belief_out, np.ndarray)
+        and belief_out.shape == (N,)
+        and belief_out.dtype == np.float64
+        and belief_out.flags.writeable
     ):
-        raise ValueError(f"belief must be an array of shape ({N},) and type float64 that can be written to")
-    return _search(task, nets, rounds, Settings() if settings is None else check_settings(settings), belief)
+        raise ValueError(f"belief_out must be an array of shape ({N},) and type float64 that can be written to")
+    return _search(task, nets, rounds, Settings() if settings is None else check_settings(settings), belief_out)
 
 
 def _search(
-    task: Task, nets: SearchNetworks, rounds: int | None, settings: Settings, belief: NDArray[np.float64] | None
+    task: Task, nets: SearchNetworks, rounds: int | None, settings: Settings, belief_out: NDArray[np.float64] | None
 ) -> Iterator[Step]:
     began = working_clock()
     end = began + task.seconds_left()
@@ -197,8 +197,8 @@ def _search(
             reported, spoken = int(counts[SIZE]), (now := working_clock())
     if not counts[SWAPPED] and end - now > SWAP_ROUNDS * sum(took):
         finish_search(arena, limit)
-    if belief is not None:
-        read_belief(arena, belief)
+    if belief_out is not None:
+        read_belief(arena, belief_out)
     yield _news(counts, member, reported)
 
 

@@ -92,7 +92,7 @@ def _long(task: Task, left: float, n_jobs: int) -> Iterator[Step]:
     best, belief = np.zeros(task.problem.n_points, dtype=np.bool_), np.full(task.problem.n_points, 0.5)
     untimed = replace(task, deadline=np.inf)  # so that the learned search ends by itself
     first = propose(task) if task.problem.n_points <= PROPOSED_POINTS else iter(())
-    for step in chain(first, learned(untimed, belief=belief)):
+    for step in chain(first, learned(untimed, belief_out=belief)):
         if step.subset is not None and np.count_nonzero(step.subset) > np.count_nonzero(best):
             best = step.subset
         yield step

@@ -54,7 +54,7 @@ def prove(
         return
     belief = np.full(task.problem.n_points, 0.5)
     untimed = replace(task, deadline=np.inf)  # so that the learned search ends by itself
-    for step in chain(propose(task), learned(untimed, belief=belief)):
+    for step in chain(propose(task), learned(untimed, belief_out=belief)):
         if step.subset is not None and np.count_nonzero(step.subset) > np.count_nonzero(best):
             best = step.subset
         yield step
