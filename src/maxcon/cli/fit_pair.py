@@ -232,7 +232,7 @@ def pair_table(pair: Pair, found: FundamentalFit, refine: str | None, notes: lis
     if found.degeneracy.note is not None:
         table.add_row("note", Text(found.degeneracy.note, style="yellow"))
     if np.isfinite(found.F).all():
-        table.add_row("Sampson", f"median {number(found.median_sampson)} pixels (inliers of the linear problem, from F)")
+        table.add_row("Sampson", f"median {number(found.median_sampson)} pixels (linear inliers, from F)")
         if found.pixels is not None:
             near = np.count_nonzero(found.within())
             table.add_row("polished", f"{near} of {N} ({near / N:.1%}) within {found.pixels:g} px of F (Sampson)")

@@ -3,7 +3,7 @@
 | parameters | time limit | what is done |
 | --- | --- | --- |
 | up to 3 | none, or enough for a proof (`PROOF_SECONDS`) | the exact search |
-| up to 3 | less | the learned search for `SHORT_SHARE` of the time, then the exact search |
+| up to 3 | less | the learned search for `SHORT_SHARE` of the time; then the exact search, or `RATE_SECONDS`: it anew |
 | up to 3 | less than twice `EASY_SECONDS` a point | the learned search |
 | more | none | `propose`, the learned search until it has settled, then `BRIEF_WORK` of the exact search |
 | more | up to `ALL_LEARNED` seconds a point, at most `MOST_LEARNED`, and no gap asked for | the learned search |
@@ -29,8 +29,12 @@ from maxcon.search.refine import swap_refinement
 #: Seconds a point that the exact search takes at 90% outliers and N = 1000, by the number of parameters.
 PROOF_SECONDS = {0: 9e-7, 1: 9e-7, 2: 9e-7, 3: 4e-5}
 
-#: Where the time is too short for a proof, this part of it goes to the learned search first.
+#: Where the time is too short for any proof, this part of it goes to the learned search first.
 SHORT_SHARE = 0.5
+
+#: With three parameters and a share s of inliers the exact search takes some ``RATE_SECONDS * N ** 0.75 / s ** 2``
+#: seconds (N = 100 to 1000, s = .1 to .5): where that is more than is left, the learned search begins anew instead.
+RATE_SECONDS = 2e-6
 
 #: Seconds a point that the exact search takes at 20% outliers: in less, no time is kept for it.
 EASY_SECONDS = 1e-6
@@ -83,8 +87,15 @@ def _short(task: Task, left: float) -> Iterator[Step]:
     if (1.0 - SHORT_SHARE) * left < EASY_SECONDS * task.problem.n_points:
         yield from learned(task)
         return
-    yield from learned(replace(task, deadline=task.deadline - (1.0 - SHORT_SHARE) * left))
-    yield from prove(task)
+    found = 0
+    for step in learned(replace(task, deadline=task.deadline - (1.0 - SHORT_SHARE) * left)):
+        found = found if step.subset is None else int(np.count_nonzero(step.subset))
+        yield step
+    N = task.problem.n_points
+    if task.problem.n_params < 3 or RATE_SECONDS * N**0.75 * (N / max(found, 1)) ** 2 <= task.seconds_left():
+        yield from prove(task)
+    else:
+        yield from learned(task)
 
 
 def _long(task: Task, left: float, n_jobs: int) -> Iterator[Step]:
