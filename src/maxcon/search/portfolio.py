@@ -4,7 +4,7 @@
 | --- | --- | --- |
 | up to 3 | none, or enough for a proof (`PROOF_SECONDS`) | the exact search |
 | up to 3 | less | the learned search for `SHORT_SHARE` of the time; then the exact search, or `RATE_SECONDS`: it anew |
-| up to 3 | less than twice `EASY_SECONDS` a point | the learned search |
+| up to 3 | less than twice an easy proof (`EASY_SECONDS`, `EASY_SHARE`) | the learned search |
 | more | none | `propose`, the learned search until it has settled, then `BRIEF_WORK` of the exact search |
 | more | up to `ALL_LEARNED` seconds a point, at most `MOST_LEARNED`, and no gap asked for | the learned search |
 | more | more | `propose` and the learned search, at most `LONG_SHARE` of the time; then the exact search |
@@ -36,8 +36,9 @@ SHORT_SHARE = 0.5
 #: seconds (N = 100 to 1000, s = .1 to .5): where that is more than is left, the learned search begins anew instead.
 RATE_SECONDS = 2e-6
 
-#: Seconds a point that the exact search takes at 20% outliers: in less, no time is kept for it.
-EASY_SECONDS = 1e-6
+#: Seconds a point that the exact search takes at 20% outliers with up to two parameters, and the share of inliers by
+#: which a proof with three is reckoned: in less, no time is kept for it.
+EASY_SECONDS, EASY_SHARE = 1e-6, 0.5
 
 #: With more than three parameters no proof is attempted in so little time, in seconds a point: what it would find or
 #: prove is less than what the learned search still gains.
@@ -84,18 +85,23 @@ def auto(task: Task, *, n_jobs: int = -1) -> Iterator[Step]:
 
 
 def _short(task: Task, left: float) -> Iterator[Step]:
-    if (1.0 - SHORT_SHARE) * left < EASY_SECONDS * task.problem.n_points:
+    N, d = task.problem.n_points, task.problem.n_params
+    if (1.0 - SHORT_SHARE) * left < (EASY_SECONDS * N if d < MOST_PARAMETERS else _proof_seconds(N, EASY_SHARE)):
         yield from learned(task)
         return
     found = 0
     for step in learned(replace(task, deadline=task.deadline - (1.0 - SHORT_SHARE) * left)):
         found = found if step.subset is None else int(np.count_nonzero(step.subset))
         yield step
-    N = task.problem.n_points
-    if task.problem.n_params < 3 or RATE_SECONDS * N**0.75 * (N / max(found, 1)) ** 2 <= task.seconds_left():
+    if d < MOST_PARAMETERS or _proof_seconds(N, max(found, 1) / N) <= task.seconds_left():
         yield from prove(task)
     else:
         yield from learned(task)
+
+
+def _proof_seconds(n_points: int, inlier_share: float) -> float:
+    """Return about how long the exact search takes with three parameters."""
+    return float(RATE_SECONDS * n_points**0.75 / inlier_share**2)
 
 
 def _long(task: Task, left: float, n_jobs: int) -> Iterator[Step]:
