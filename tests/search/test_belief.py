@@ -7,7 +7,7 @@ from maxcon.agent.search_networks import shipped_search_networks
 from maxcon.datasets.synthetic import synthetic_hyperplane
 from maxcon.search.anytime import make_task
 from maxcon.search.belief import MOST_LACK, MOST_LOGIT, TEMPERATURES, agreement, cast_vote, forget_votes, nearness
-from maxcon.search.learned_kernels import begin_search, play_rounds
+from maxcon.search.learned_kernels import PARTS, begin_search, play_parts
 from maxcon.search.learned_memory import allocate_arena, carve
 from maxcon.search.learned_settings import Settings as RoundSettings
 from maxcon.search.random_kernels import seed_state
@@ -59,7 +59,8 @@ def played(rate, rounds, d=4, seed=0):
     nets = shipped_search_networks()
     arena = allocate_arena(task.rows, seed_state(task.rng), nets.points, nets.peel)
     begin_search(arena, task.limit)
-    play_rounds(arena, task.limit, RoundSettings(), rounds)
+    for _ in range(rounds):
+        play_parts(arena, task.limit, RoundSettings(), 0, PARTS)
     return carve(arena)
 
 

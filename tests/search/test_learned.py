@@ -36,7 +36,6 @@ from maxcon.search.learned_kernels import (
     begin_search_belief,
     finish_search,
     play_parts,
-    play_rounds,
 )
 from maxcon.search.learned_memory import FLAGS_USED, FLOATS_USED, INTEGERS_USED, N_COUNTS, SIZE, allocate_arena, carve
 from maxcon.search.learned_settings import Settings
@@ -44,6 +43,11 @@ from maxcon.search.random_kernels import seed_state
 from maxcon.search.refine import swap_refinement
 
 compiled_only = pytest.mark.skipif(config.DISABLE_JIT, reason="takes minutes where kernels are interpreted")
+
+
+def play_rounds(arena, limit, settings, rounds):
+    for _ in range(rounds):
+        play_parts(arena, limit, settings, 0, PARTS)
 
 
 def task_for(A, b, threshold, seed=0, time_limit=None):

@@ -376,14 +376,6 @@ def play_parts(arena: Arena, limit: float, settings: Settings, first: int, last:
 
 
 @kernel
-def play_rounds(arena: Arena, limit: float, settings: Settings, rounds: int) -> None:
-    """Do whole rounds."""
-    search = carve(arena)
-    for _ in range(rounds):
-        play(search, limit, settings, PROPOSE, PARTS)
-
-
-@kernel
 def play_coarse_round(arena: Arena, limit: float, settings: Settings) -> None:
     """Do a round without walks and swaps, on some of the points: a better vertex of these is none of all points."""
     search = carve(arena)

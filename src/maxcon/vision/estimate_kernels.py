@@ -25,6 +25,59 @@ _DRAWS = 24
 
 
 @kernel
+def eliminate_row(row: NDArray[np.float64], rank: int, table: NDArray[np.float64], places: NDArray[np.int64]) -> bool:
+    """Write a row, shape (9,), freed of the `rank` rows before it, into ``table[rank]``; False if it depends on them.
+
+    `places` tells which column has gone where; it starts as 0, 1, 2, ...
+    """
+    length = 0.0
+    for j in range(9):
+        table[rank, j] = row[places[j]]
+        length = max(length, abs(table[rank, j]))
+    for k in range(rank):
+        c = table[rank, k]
+        for j in range(k + 1, 9):
+            table[rank, j] -= c * table[k, j]
+    place = rank
+    largest = 0.0
+    for j in range(rank, 9):
+        if abs(table[rank, j]) > largest:
+            largest = abs(table[rank, j])
+            place = j
+    if largest <= _DEPENDENT * length:
+        return False
+    if place != rank:
+        places[rank], places[place] = places[place], places[rank]
+        for k in range(rank + 1):
+            table[k, rank], table[k, place] = table[k, place], table[k, rank]
+    pivot = table[rank, rank]
+    for j in range(rank + 1, 9):
+        table[rank, j] /= pivot
+    return True
+
+
+@kernel
+def write_null_vector(
+    rank: int, free: int, table: NDArray[np.float64], places: NDArray[np.int64], f: NDArray[np.float64]
+) -> float:
+    """Write the f on which the `rank` rows of `table` vanish, 1 in column `free` >= rank and 0 in the other free ones.
+
+    The rows, made by `eliminate_row`, are unit upper triangular. Returns the square of its length.
+    """
+    for j in range(rank, 9):
+        f[places[j]] = 0.0
+    f[places[free]] = 1.0
+    square = 1.0
+    for k in range(rank - 1, -1, -1):
+        value = -table[k, free]
+        for j in range(k + 1, rank):
+            value -= table[k, j] * f[places[j]]
+        f[places[k]] = value
+        square += value * value
+    return square
+
+
+@kernel
 def null_vector(
     rows: NDArray[np.float64],
     pool: NDArray[np.int64],
@@ -46,42 +99,9 @@ def null_vector(
         if rank == 8:
             break
         point = draw_next(state, pool, draw, n_points)
-        length = 0.0
-        for j in range(9):
-            table[rank, j] = rows[point, places[j]]
-            length = max(length, abs(table[rank, j]))
-        for k in range(rank):
-            c = table[rank, k]
-            for j in range(k + 1, 9):
-                table[rank, j] -= c * table[k, j]
-        place = rank
-        largest = 0.0
-        for j in range(rank, 9):
-            if abs(table[rank, j]) > largest:
-                largest = abs(table[rank, j])
-                place = j
-        if largest <= _DEPENDENT * length:
-            continue
-        if place != rank:
-            places[rank], places[place] = places[place], places[rank]
-            for k in range(rank + 1):
-                table[k, rank], table[k, place] = table[k, place], table[k, rank]
-        pivot = table[rank, rank]
-        for j in range(rank + 1, 9):
-            table[rank, j] /= pivot
-        rank += 1
-    # The rows are unit upper triangular: the last of the free entries is 1, other free ones 0, the rest follow.
-    for j in range(rank, 9):
-        f[places[j]] = 0.0
-    f[places[8]] = 1.0
-    square = 1.0
-    for k in range(rank - 1, -1, -1):
-        value = -table[k, 8]
-        for j in range(k + 1, rank):
-            value -= table[k, j] * f[places[j]]
-        f[places[k]] = value
-        square += value * value
-    length = sqrt(square)
+        if eliminate_row(rows[point], rank, table, places):
+            rank += 1
+    length = sqrt(write_null_vector(rank, 8, table, places, f))
     for j in range(9):
         f[j] /= length
 

@@ -13,10 +13,11 @@ from numpy.typing import NDArray
 
 from maxcon.minimax.jit import kernel
 from maxcon.search.random_kernels import draw_next
+from maxcon.vision.estimate_kernels import eliminate_row, write_null_vector
 from maxcon.vision.polish_kernels import anneal, descend, frame_of, matrix_of, score
 
-#: How many matches are drawn for 7 independent ones; what elimination leaves of a dependent one, relatively.
-_DRAWS, _DEPENDENT = 21, 1e-9
+#: How many matches are drawn for 7 independent ones.
+_DRAWS = 21
 
 #: A cubic whose leading coefficient is smaller than this part of all has an infinite root, and is passed over.
 _INFINITE = 1e-12
@@ -84,41 +85,11 @@ def seven_point(
             y,
             1.0,
         )
-        largest = 0.0
-        for j in range(9):
-            table[rank, j] = row[places[j]]
-            largest = max(largest, abs(table[rank, j]))
-        least = _DEPENDENT * largest
-        for k in range(rank):
-            c = table[rank, k]
-            for j in range(k + 1, 9):
-                table[rank, j] -= c * table[k, j]
-        place, largest = rank, 0.0
-        for j in range(rank, 9):
-            if abs(table[rank, j]) > largest:
-                largest, place = abs(table[rank, j]), j
-        if largest <= least:
-            continue
-        if place != rank:
-            places[rank], places[place] = places[place], places[rank]
-            for k in range(rank + 1):
-                table[k, rank], table[k, place] = table[k, place], table[k, rank]
-        pivot = table[rank, rank]
-        for j in range(rank + 1, 9):
-            table[rank, j] /= pivot
-        rank += 1
-    # The rows are unit upper triangular: of the free entries 7 or 8 is 1 and others 0, the rest follow.
+        if eliminate_row(row, rank, table, places):
+            rank += 1
     p, q = models[0], models[1]
     for which in range(2):
-        f = models[which]
-        for j in range(rank, 9):
-            f[places[j]] = 0.0
-        f[places[7 + which]] = 1.0
-        for k in range(rank - 1, -1, -1):
-            value = -table[k, 7 + which]
-            for j in range(k + 1, rank):
-                value -= table[k, j] * f[places[j]]
-            f[places[k]] = value
+        write_null_vector(rank, 7 + which, table, places, models[which])
     roots = models[2]
     count = _cubic_roots(_determinant(p), _mixed(p, q), _mixed(q, p), _determinant(q), roots)
     if count == 0 and rank < 7:
