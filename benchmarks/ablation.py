@@ -28,6 +28,7 @@ import json  # noqa: E402
 import platform  # noqa: E402
 import time  # noqa: E402
 from collections.abc import Sequence  # noqa: E402
+from contextlib import nullcontext  # noqa: E402
 from functools import partial  # noqa: E402
 from pathlib import Path  # noqa: E402
 from typing import Any, NamedTuple  # noqa: E402
@@ -43,6 +44,7 @@ from maxcon.agent.search_networks import SearchNetworks, shipped_search_networks
 from maxcon.experiments import self_imitation  # noqa: E402
 from maxcon.experiments.search_instances import FAMILIES, Ranges, draw_problem, make_problem  # noqa: E402
 from maxcon.experiments.self_imitation import Learner, Recipe, Recorder, best_known, train_search_networks  # noqa: E402
+from maxcon.minimax.clock import processor_time  # noqa: E402
 from maxcon.search.anytime import make_task  # noqa: E402
 from maxcon.search.learned import learned  # noqa: E402
 from maxcon.search.learned_settings import Settings  # noqa: E402
@@ -266,7 +268,7 @@ def main() -> None:
     parser.add_argument("--rounds", type=int, default=20, help="of training")
     parser.add_argument("--train-seed", type=int, default=1)
     parser.add_argument("--fit-rule", action="store_true", help="print the linear point rule and stop")
-    parser.add_argument("--cpu-time", action="store_true", help="count the thread's time: for a machine that is shared")
+    parser.add_argument("--cpu-time", action="store_true", help="the processor's time: for a shared machine")
     parser.add_argument("--out", type=Path, default=None, help="write all records there, JSON")
     options = parser.parse_args()
     if options.fit_rule:
@@ -282,8 +284,11 @@ def main() -> None:
             parser.error(f"--variants must be some of {', '.join(map(repr, table))}, not {unknown}")
         wanted = {SHIPPED, *options.variants, *(table[name].reference for name in options.variants)}
         table = {name: variant for name, variant in table.items() if name in wanted}
-    if options.cpu_time:
-        time.perf_counter = time.thread_time
+    with processor_time() if options.cpu_time else nullcontext():
+        compare(table, options)
+
+
+def compare(table: dict[str, Variant], options: argparse.Namespace) -> None:
     print(f"{platform.processor() or platform.machine()}, one thread; {options.instances} x {options.seeds} a cell")
     records: list[dict[str, Any]] = []
     for cell in options.cells:

@@ -1,4 +1,5 @@
 import json
+import time
 from dataclasses import asdict, replace
 
 import numpy as np
@@ -7,6 +8,7 @@ import pytest
 import maxcon
 from maxcon.experiments import bench
 from maxcon.experiments.bench import Settings, check_settings, header, known_methods, quick, run_bench, usual_methods
+from maxcon.experiments.bench_calibration import Choice
 from maxcon.experiments.bench_cells import Cell, make_instance
 from maxcon.experiments.bench_peers import PEERS, installed
 from maxcon.experiments.bench_records import BenchFile, Row, Unit, read_bench, unit_of
@@ -244,3 +246,36 @@ def test_units_are_read_as_they_were_written():
     unit = Unit("line", 10, 20, 3, 1, 8, False, "peel", [Row("auto", 1.0, [8, 7], [0.5, 0.6])], {"agent": "no"}, 0, 0.9)
     assert unit_of(json.loads(json.dumps(asdict(unit)))) == unit
     assert (unit.cell, unit.name) == ("line/10/20", "line/10/20/1.3")
+
+
+def test_the_processors_time_leaves_out_pauses(monkeypatch):
+    settings = replace(TINY, families=("line",), budgets=(20.0,), methods=("auto",), instances=1, cpu_time=True)
+    instance = make_instance(Cell("line", 30, 30), 0, 0)
+    fitted = bench.fit
+
+    def interrupted(*arguments, **options):
+        time.sleep(0.1)
+        return fitted(*arguments, **options)
+
+    monkeypatch.setattr(bench, "fit", interrupted)
+    assert max(bench.our_row(instance, "auto", 20.0, 2).ms) > 90
+    (unit,) = run_units(settings)
+    assert max(unit.rows[0].ms) < 90
+    assert unit.core < 0.5
+
+
+def run_units(settings):
+    """Return what is found, without a file."""
+    return [bench._run(bench._Work(settings, cell, 0, {})) for cell in settings.cells()]
+
+
+def test_everyone_has_a_turn_to_be_the_first():
+    settings = replace(TINY, families=("line",), methods=("auto", "ransac", "gnc", "skimage-ransac"), instances=8)
+    cell = settings.cells()[0]
+    peers = {each.name: asdict(Choice(4, 1.0, 0.0, 0.0)) for each in PEERS}
+    choices = {name: {f"{budget:g}": choice for budget in settings.budgets} for name, choice in peers.items()}
+    first = [bench._run(bench._Work(settings, cell, number, choices)).rows[0].method for number in range(8)]
+    assert len(set(first)) > 1
+    again = bench._run(bench._Work(settings, cell, 0, choices))
+    assert again.rows[0].method == first[0]
+    assert {each.method for each in again.rows} == set(settings.methods)

@@ -51,6 +51,7 @@ WORSE = 1
 @click.option(
     "--jobs", type=click.IntRange(min=1), default=1, show_default=True, help="Instances at a time; they disturb times."
 )
+@click.option("--cpu-time", is_flag=True, help="Count the processor's time: for a machine that has other work, too.")
 @click.option("--out", metavar="DIR", default="bench", show_default=True, help="Where all goes; called again, goes on.")
 @click.option(
     "--compare", "pair", nargs=2, metavar="OLD NEW", help="Run nothing; say what changed between two folders."
@@ -70,6 +71,7 @@ def command(
     proof_time: float | None,
     long_time: float | None,
     jobs: int,
+    cpu_time: bool,
     out: str,
     pair: tuple[str, str] | None,
 ) -> None:
@@ -99,6 +101,7 @@ def command(
         settings,
         seed=seed,
         jobs=jobs,
+        cpu_time=cpu_time,
         instances=settings.instances if instances is None else instances,
         seeds=settings.seeds if seeds is None else seeds,
         proof_time=settings.proof_time if proof_time is None else proof_time,

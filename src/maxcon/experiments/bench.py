@@ -1,8 +1,9 @@
 """The benchmark: all methods and the installed peers on the same instances, with the same time, under one residual.
 
-Every method gets a budget of wall-clock time on one core, from the problem (for peers: from the data in the form
-that they take) to its model. What counts is how many points that model explains within the threshold, recounted here.
-The gap is the largest consensus known minus that count.
+Every method gets a budget of time on one core, on the wall's clock or on the processor's, from the problem (for
+peers: from the data in the form that they take) to its model. On each instance the methods take their turns in random
+order. What counts is how many points that model explains within the threshold, recounted here. The gap is the largest
+consensus known minus that count.
 """
 
 from __future__ import annotations
@@ -12,7 +13,8 @@ import gc
 import inspect
 import os
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import asdict, dataclass, replace
 from importlib import import_module
 from typing import Any
@@ -26,6 +28,7 @@ from maxcon.experiments.bench_records import BenchFile, Row, Unit, code_digest
 from maxcon.experiments.distribution import distribute
 from maxcon.experiments.records import processor, versions
 from maxcon.fitting import METHODS, fit
+from maxcon.minimax.clock import processor_time, read_clock
 from maxcon.problem import Consensus, LinearProblem
 
 #: More samples or tries than any budget has room for: only the time ends a search.
@@ -81,6 +84,8 @@ class Settings:
         How many instances a cell has for the calibration of the peers.
     jobs
         How many instances are run at a time; more than one disturb each other's times.
+    cpu_time
+        Whether the processor's time is counted, instead of that on the wall's clock.
     """
 
     families: tuple[str, ...] = ("line", "plane", "hyperplane", "fundamental", "fundamental-F32")
@@ -95,6 +100,7 @@ class Settings:
     long_time: float = 0.3
     calibration: int = 4
     jobs: int = 1
+    cpu_time: bool = False
 
     def cells(self) -> tuple[Cell, ...]:
         """Return the grid."""
@@ -231,7 +237,8 @@ def _calibrate(work: tuple[Settings, Cell]) -> tuple[str, dict[str, Any]]:
     instances = [make_instance(cell, number, settings.seed, CALIBRATION) for number in range(settings.calibration)]
     found = {}
     for peer in peers_for(cell.family, settings.methods):
-        best = calibrate(peer, instances, [1e-3 * budget for budget in settings.budgets])
+        with _clock(settings):
+            best = calibrate(peer, instances, [1e-3 * budget for budget in settings.budgets])
         found[peer.name] = {f"{1e3 * budget:g}": asdict(choice) for budget, choice in best.items()}
     return cell.name, found
 
@@ -243,23 +250,14 @@ def _run(work: _Work) -> Unit:
     ours = [name for name in settings.methods if name not in peer_names()]
     unserved = {name: reason for name in ours if (reason := _reason(name, work.cell.family)) is not None}
     served = [name for name in ours if name not in unserved]
-    _warm_ours(work.cell, tuple(served), settings.budgets)
-    _warm_peers(work.cell.family, settings.methods)
-    rows: list[Row] = []
-    # The first fits of an instance find cold caches: one is thrown away, and each method has its turn to be the first.
-    first = work.number % max(len(served), 1)
-    served = served[first:] + served[:first]
-    if served:
-        timed_fit(instance, served[0], 1e-3, 0)
-    began, worked = time.perf_counter(), time.process_time()
-    for budget in settings.budgets:
-        rows += [our_row(instance, name, budget, settings.seeds) for name in served]
-        for peer in peers_for(work.cell.family, settings.methods):
-            choice = Choice(**work.choices[peer.name][f"{budget:g}"])
-            rows.append(peer_row(instance, peer, choice, budget, settings.seeds))
-    core = (time.process_time() - worked) / max(time.perf_counter() - began, 1e-9)
+    with _clock(settings):
+        _warm_ours(work.cell, tuple(served), settings.budgets)
+        _warm_peers(work.cell.family, settings.methods)
+        began, worked = time.perf_counter(), time.process_time()
+        rows = _rows(work, instance, served)
+        core = (time.process_time() - worked) / max(time.perf_counter() - began, 1e-9)
+        reference, proven, finder = _reference(instance, settings)
     best = max((max(each.inliers) for each in rows), default=0)
-    reference, proven, finder = _reference(instance, settings)
     above = sum(count > reference for each in rows for count in each.inliers) if proven else 0
     if best > reference and not proven:
         reference, finder = best, next(each.method for each in rows if max(each.inliers) == best)
@@ -278,6 +276,28 @@ def _run(work: _Work) -> Unit:
         core=round(core, 3),
         code=code_digest(),
     )
+
+
+def _rows(work: _Work, instance: Instance, served: Sequence[str]) -> list[Row]:
+    """Return what everyone finds on an instance, budget by budget, each time in an order of its own.
+
+    The first on an instance finds cold caches, as does whoever comes after one that fills them with other things.
+    """
+    settings, rows = work.settings, []
+    order = np.random.default_rng([settings.seed, work.number])
+    peers = {peer.name: peer for peer in peers_for(work.cell.family, settings.methods)}
+    for budget in settings.budgets:
+        for name in order.permutation([*served, *peers]):
+            if name in peers:
+                choice = Choice(**work.choices[name][f"{budget:g}"])
+                rows.append(peer_row(instance, peers[name], choice, budget, settings.seeds))
+            else:
+                rows.append(our_row(instance, str(name), budget, settings.seeds))
+    return rows
+
+
+def _clock(settings: Settings) -> AbstractContextManager[None]:
+    return processor_time() if settings.cpu_time else nullcontext()
 
 
 def our_row(instance: Instance, name: str, budget: float, seeds: int) -> Row:
@@ -321,9 +341,9 @@ def timed_fit(instance: Instance, name: str, time_limit: float, seed: int) -> tu
     collecting = gc.isenabled()
     gc.disable()
     try:
-        began = time.perf_counter()
+        began = read_clock()
         result = fit(problem, instance.threshold, method=method, rng=seed, time_limit=time_limit, **options)
-        seconds = time.perf_counter() - began
+        seconds = read_clock() - began
     finally:
         if collecting:
             gc.enable()

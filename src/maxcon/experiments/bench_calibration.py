@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import gc
-import time
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -12,6 +11,7 @@ import numpy as np
 
 from maxcon.experiments.bench_cells import Instance
 from maxcon.experiments.bench_peers import Model, Peer, Run
+from maxcon.minimax.clock import read_clock
 
 #: Iterations of the first rung of the ladder, and the factor from rung to rung.
 FIRST, FACTOR = 2, 2
@@ -55,13 +55,13 @@ def timed(run: Run, iterations: int, threshold: float) -> tuple[Model | None, fl
     with warnings.catch_warnings(), np.errstate(all="ignore"):
         warnings.simplefilter("ignore")
         gc.disable()
-        began = time.perf_counter()
+        began = read_clock()
         try:
             model, error = run(iterations, threshold), None
         except Exception as raised:  # whatever it is, it is a row of the record and not the end of the benchmark
             model, error = None, f"{type(raised).__name__}: {raised}".partition("\n")[0]
         finally:
-            seconds = time.perf_counter() - began
+            seconds = read_clock() - began
             if collecting:
                 gc.enable()
     return model, seconds, error

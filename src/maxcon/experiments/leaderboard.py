@@ -37,8 +37,9 @@ _RULES = f"""
   way. Tables show the mean over the instances +- its standard error; the seeds of an instance are averaged first.
 - The largest consensus known is the proven optimum where the exact method proves one within its time limit, and else
   the best that any method found within any budget or in a long run.
-- A budget is wall-clock time on one core. For our methods it covers everything from the problem to the result; for
+- A budget is {{clock}} on one core. For our methods it covers everything from the problem to the result; for
   peers it covers their call alone, on data in the form that they take. Counting inliers is outside it for everyone.
+  On each instance the methods take their turns in random order.
 - Peers have, for each cell and budget, the number of iterations that fits and the best threshold, found on
   separate instances (calibration.jsonl says which). Nothing of ours refines what they return. Peers for fundamental
   matrices return matrices of rank 2 and measure pixels; they are judged by the algebraic residual of the chart.
@@ -90,8 +91,13 @@ def page_text(header: Mapping[str, Any], units: Sequence[Unit], absent: Mapping[
     """Return the page."""
     scores = summarise(units)
     lost = lost_cells(scores)
-    parts = ["# Leaderboard\n", _about(header, units, scores), _notes(units, absent), "## How to read it\n" + _RULES]
-    parts.append(_checks(units, scores))
+    parts = [
+        "# Leaderboard\n",
+        _about(header, units, scores),
+        _notes(units, absent),
+        "## How to read it\n" + _RULES.format(clock=_clock(header)),
+    ]
+    parts.append(_checks(units, scores, busy=not header["settings"].get("cpu_time")))
     parts.append(_lost_text(lost, scores))
     for family in dict.fromkeys(each.cell[0] for each in scores):
         mine = [each for each in scores if each.cell[0] == family]
@@ -101,6 +107,11 @@ def page_text(header: Mapping[str, Any], units: Sequence[Unit], absent: Mapping[
         parts.append(_family_table([each for each in families(scores) if each.family == family]))
         parts += [_size_tables(mine, n_points) for n_points in sorted({each.cell[1] for each in mine})]
     return "\n".join(parts)
+
+
+def _clock(header: Mapping[str, Any]) -> str:
+    """Return which time was counted."""
+    return "time on the processor" if header["settings"].get("cpu_time") else "wall-clock time"
 
 
 def family_lines(scores: Sequence[Score]) -> list[str]:
@@ -176,7 +187,7 @@ def _notes(units: Sequence[Unit], absent: Mapping[str, str]) -> str:
     return "Not in the tables:\n\n" + "\n".join(lines) + "\n" if lines else ""
 
 
-def _checks(units: Sequence[Unit], scores: Sequence[Score]) -> str:
+def _checks(units: Sequence[Unit], scores: Sequence[Score], *, busy: bool) -> str:
     runs = sum(each.runs for each in scores)
     violations = sum(each.violations for each in scores)
     above = sum(each.above_proven for each in units)
@@ -196,7 +207,7 @@ def _checks(units: Sequence[Unit], scores: Sequence[Score]) -> str:
         f"- {proven} of {len(units)} references are proven optima"
         + (f"; the others: {best_known}." if finders else "."),
         f"- {late} of {runs} runs were late ({late / max(runs, 1):.1%}).",
-        f"- The runs had {core:.0%} of a core" + (_BUSY if core < 0.95 else "."),
+        f"- The runs had {core:.0%} of a core" + (_BUSY if busy and core < 0.95 else "."),
     ]
     if failed:
         counts: dict[str, int] = {}

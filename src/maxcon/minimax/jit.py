@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 import re
 import sys
-import time
 from collections.abc import Callable
 from functools import cache
 from pathlib import Path
@@ -14,6 +13,8 @@ from typing import Any, TypeVar, cast
 
 import numba
 from numba.core import config, event
+
+from maxcon.minimax.clock import read_clock
 
 F = TypeVar("F", bound=Callable[..., Any])
 
@@ -102,7 +103,7 @@ class _Making(event.Listener):  # type: ignore[misc]
     def on_start(self, event: Any) -> None:
         with self._lock:
             if not self._threads:
-                self._since = time.perf_counter()
+                self._since = read_clock()
             self._threads.append(get_ident())
 
     def on_end(self, event: Any) -> None:
@@ -110,7 +111,7 @@ class _Making(event.Listener):  # type: ignore[misc]
             if get_ident() in self._threads:
                 self._threads.remove(get_ident())
                 if not self._threads:
-                    self.seconds += time.perf_counter() - self._since
+                    self.seconds += read_clock() - self._since
 
     def so_far(self) -> float:
         """Return the seconds of all kernels, with the one that another thread may be at."""
@@ -118,7 +119,7 @@ class _Making(event.Listener):  # type: ignore[misc]
             # A thread that asks is at no kernel: Ctrl-C has met it while it waited for the lock, and it got no end.
             while get_ident() in self._threads:
                 self._threads.remove(get_ident())
-            return self.seconds + (time.perf_counter() - self._since if self._threads else 0.0)
+            return self.seconds + (read_clock() - self._since if self._threads else 0.0)
 
 
 _making = _Making()
@@ -134,4 +135,4 @@ def compile_seconds() -> float:
 
 def working_clock() -> float:
     """Return the time in seconds, from some moment on, without what compiling and loading kernels takes."""
-    return time.perf_counter() - compile_seconds()
+    return read_clock() - compile_seconds()

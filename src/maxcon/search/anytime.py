@@ -7,7 +7,6 @@ computes for long yields at least every few hundredths of a second, an empty Ste
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from typing import Any, Protocol
@@ -16,7 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from maxcon.minimax import LinearRows, linear_rows
-from maxcon.minimax.jit import compile_seconds
+from maxcon.minimax.clock import read_clock
+from maxcon.minimax.jit import compile_seconds, working_clock
 from maxcon.problem import LinearProblem
 
 
@@ -35,8 +35,8 @@ class Task:
     rng
         The only source of random numbers.
     deadline
-        ``time.perf_counter()`` at which to stop, or infinity; ask `over` and `seconds_left`, which know what does not
-        count. The loop stops a method between steps; a method need look at it only to size a long step.
+        The `read_clock` at which to stop, or infinity; ask `over` and `seconds_left`, which know what does not count.
+        The loop stops a method between steps; a method need look at it only to size a long step.
     gap
         The gap at which the search may stop.
     compiled
@@ -54,7 +54,7 @@ class Task:
 
     def seconds_left(self) -> float:
         """Return the seconds until the deadline, or infinity."""
-        return self.deadline + compile_seconds() - self.compiled - time.perf_counter()
+        return self.deadline + compile_seconds() - self.compiled - read_clock()
 
     def over(self) -> bool:
         """Whether the time is over."""
@@ -133,7 +133,7 @@ def make_task(
 ) -> Task:
     """Return the task for `problem`: whitened rows, the limit on gamma in their unit, the deadline."""
     compiled = compile_seconds()
-    deadline = np.inf if time_limit is None else time.perf_counter() + time_limit
+    deadline = np.inf if time_limit is None else read_clock() + time_limit
     rows = linear_rows(problem)
     limit = problem.inlier_limit(threshold) / rows.scale
     return Task(problem, rows, threshold, limit, rng, deadline, gap, compiled)
@@ -149,7 +149,7 @@ def run(
 
     Kernels that are compiled on the way, once on a machine, do not count against the deadline.
     """
-    began = time.perf_counter()
+    began = working_clock()
     best = Best(upper_bound=task.problem.n_points)
     try:
         for step in steps:
@@ -163,8 +163,8 @@ def run(
                     best.subset, best.size, news = subset, size, True
                     if step.path is not None:
                         best.path = step.path
-            now = time.perf_counter()
-            if callback is not None and news and callback(Progress(best.size, best.upper_bound, now - began)):
+            seconds = working_clock() - began
+            if callback is not None and news and callback(Progress(best.size, best.upper_bound, seconds)):
                 break
             if (best.subset is not None and best.gap <= task.gap) or task.over():
                 break

@@ -26,7 +26,6 @@ explains, with the points that lie within it put back, on a lower level.
 
 from __future__ import annotations
 
-import time
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from itertools import chain
@@ -35,6 +34,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from maxcon.minimax import allocate
+from maxcon.minimax.clock import read_clock
 from maxcon.minimax.linear import OK, cold_fit
 from maxcon.problem import check_indices
 from maxcon.search.anytime import Step, Task
@@ -316,9 +316,9 @@ def _steps(
             if grown is None:
                 break
             search = grown
-        began = time.perf_counter()
+        began = read_clock()
         status = advance(search, task.limit, napa, dibp, improve, fits, most_nodes)
-        fits = _next_budget(fits, time.perf_counter() - began)
+        fits = _next_budget(fits, read_clock() - began)
     if status != FINISHED:
         stats.stopped = "node_limit" if status == COUNTED_OUT else "memory_limit"
     elif proven < fewest:

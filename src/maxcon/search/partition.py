@@ -9,7 +9,6 @@ basis point, see `partition_machine`) lifts to the optimum: at the root, in the 
 from __future__ import annotations
 
 import os
-import time
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor, wait
 from threading import Event, Lock
@@ -18,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from maxcon.minimax import allocate
+from maxcon.minimax.clock import read_clock
 from maxcon.minimax.linear import OK, cold_fit
 from maxcon.search.anytime import Step, Task
 from maxcon.search.partition_jobs import LIST_TASKS, RUN_TASKS, SOLVE_NODES
@@ -339,13 +339,13 @@ class PartitionSearch:
         state.registers[[JOB, LAST]] = 0, n_jobs
         status = FULL
         while status != DONE:
-            began = time.perf_counter()
+            began = read_clock()
             left = self._max_work - self._work()
             status = advance(state, min(self._budget, left)) if left > 0 else SPENT
             if status == FULL:
                 self._states[0] = state = self._grow(state)
             elif status == BUSY:
-                seconds = max(time.perf_counter() - began, 1e-6)
+                seconds = max(read_clock() - began, 1e-6)
                 self._budget = 100 + int(self._budget * min(max(INTERVAL / seconds, 0.3), 3.0))
             if status in (BUSY, SPENT):
                 if state.registers[BEST] < state.registers[FOUND]:
