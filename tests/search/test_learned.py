@@ -246,6 +246,20 @@ def test_it_tells_what_it_believes():
         learned(task, belief_out=belief)
 
 
+def test_it_says_once_that_it_has_settled():
+    A, b = synthetic(np.random.default_rng(3), 100, 8, 0.3)
+    belief = np.full(100, np.nan)
+    task, said, best = task_for(A, b, 0.1), [], None
+    for step in learned(task, belief_out=belief):
+        best = best if step.subset is None else step.subset
+        if step.settled:
+            said.append((belief.copy(), best))
+    ((believed, then),) = said
+    assert then is not None
+    assert np.array_equal(believed > 0.5, then)
+    assert np.count_nonzero(then) <= np.count_nonzero(best)
+
+
 def test_bad_options_are_named(tmp_path):
     rng = np.random.default_rng(0)
     task = task_for(rng.normal(size=(10, 2)), rng.normal(size=10), 0.1)

@@ -75,12 +75,15 @@ class Step:
         A proven upper bound on the consensus.
     refined
         The method has refined `subset` itself, or finds the optimum without; it is taken as it is.
+    settled
+        The method expects little more of itself: whoever has another one may turn to it, and come back.
     """
 
     subset: NDArray[np.bool_] | None = None
     path: NDArray[np.int64] | None = None
     upper_bound: int | None = None
     refined: bool = False
+    settled: bool = False
 
 
 class Method(Protocol):

@@ -50,6 +50,9 @@ from maxcon.search.sampling import check_count
 #: its points are believed in with a mean probability of `SURE`, and at most a share of `DOUBTFUL` others.
 ROUNDS_AGREED, SURE, DOUBTFUL = 6, 0.9, 0.05
 
+#: After so many rounds without progress, where the belief agrees, the search says that it has settled.
+ROUNDS_SETTLED = 1
+
 #: If it does not agree: after this many, and not before the search has gone on for as long again as it took to
 #: find what it has.
 ROUNDS_OPEN = 24
@@ -121,14 +124,15 @@ def learned(
     settings
         The settings of a round; None for the defaults.
     belief_out
-        Shape (N,), float64: is told, when the search has ended, with what probability each point is an
-        inlier of the best set.
+        Shape (N,), float64: is told, when the search settles and when it has ended, with what probability each point
+        is an inlier of the best set.
 
     Yields
     ------
     Step
         Each better set, some milliseconds after it was found at latest, refined and swapped as far as the time
-        allows.
+        allows. Once, where the belief first agrees with the best set, after a round without progress, a step
+        that is `settled`; the search goes on after it.
 
     Raises
     ------
@@ -167,7 +171,7 @@ def _search(
     # Of many points, a round takes so long that the clock is looked at between its parts.
     pieces = [(k, k + 1) for k in range(PARTS)] if task.problem.n_points > MANY else [(0, PARTS)]
     took = [ROUND_ROOTS * (now - began) / len(pieces)] * len(pieces)
-    reported = 0
+    reported, settled = 0, False
     if len(pieces) > 1:
         if end - now > PAUSE:  # else the step would be the last one
             yield _news(counts, member, reported)
@@ -194,6 +198,12 @@ def _search(
         took[number], now = max(0.8 * took[number], done - now), done
         if now - spoken > PAUSE and (len(pieces) > 1 or end - now > 2.0 * took[0]):
             yield _news(counts, member, reported)
+            reported, spoken = int(counts[SIZE]), (now := working_clock())
+        if not settled and counts[STALL] >= ROUNDS_SETTLED and _agrees(counts):
+            settled = True
+            if belief_out is not None:
+                read_belief(arena, belief_out)
+            yield replace(_news(counts, member, reported), settled=True)
             reported, spoken = int(counts[SIZE]), (now := working_clock())
     if not counts[SWAPPED] and end - now > SWAP_ROUNDS * sum(took):
         finish_search(arena, limit)

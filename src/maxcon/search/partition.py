@@ -47,6 +47,10 @@ from maxcon.search.proposal import best_proposal
 #: How long the kernels run before the caller hears from them, in seconds, and the work for the first time.
 INTERVAL, FIRST_BUDGET = 0.02, 20_000
 
+#: The least work that they are called for, so that a time limit is passed by no more than some 0.1 ms; and the work
+#: of a second, until that has been measured.
+LEAST_BUDGET, SPEED = 2_000, 3e7
+
 #: All threads together may take so much memory, in bytes; beyond, the search ends with what it has proven.
 MOST_BYTES = 4 << 30
 
@@ -165,7 +169,7 @@ class PartitionSearch:
         self._n_jobs = check_jobs(n_jobs)
         self._max_work = np.iinfo(np.int64).max if max_work is None else max_work
         self._work_before = self._expanded_before = 0  # of states that are gone
-        self._budget = FIRST_BUDGET
+        self._budget, self._speed = FIRST_BUDGET, SPEED
         self._tree: MergeTree | None = None
         self._states: list[SearchState] = []
 
@@ -341,12 +345,14 @@ class PartitionSearch:
         while status != DONE:
             began = read_clock()
             left = self._max_work - self._work()
-            status = advance(state, min(self._budget, left)) if left > 0 else SPENT
+            affordable = LEAST_BUDGET + self._speed * max(self.task.seconds_left(), 0.0)
+            budget = int(min(self._budget, left, affordable))
+            status = advance(state, budget) if left > 0 else SPENT
             if status == FULL:
                 self._states[0] = state = self._grow(state)
             elif status == BUSY:
-                seconds = max(read_clock() - began, 1e-6)
-                self._budget = 100 + int(self._budget * min(max(INTERVAL / seconds, 0.3), 3.0))
+                self._speed = budget / max(read_clock() - began, 1e-6)
+                self._budget = 100 + int(min(max(INTERVAL * self._speed, 0.3 * self._budget), 3.0 * self._budget))
             if status in (BUSY, SPENT):
                 if state.registers[BEST] < state.registers[FOUND]:
                     self._consider(int(state.registers[BEST]), state.best_out)
@@ -391,7 +397,7 @@ class PartitionSearch:
             futures = [pool.submit(serve, worker) for worker in range(self._n_jobs)]
             collected = 0
             try:
-                while wait(futures, timeout=INTERVAL).not_done:
+                while wait(futures, timeout=max(min(INTERVAL, self.task.seconds_left()), 1e-3)).not_done:
                     while collected in ended:
                         self._consider(*ended[collected][1:])
                         collected += 1

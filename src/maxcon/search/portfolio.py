@@ -6,8 +6,12 @@
 | up to 3 | less | the learned search for `SHORT_SHARE` of the time; then the exact search, or `RATE_SECONDS`: it anew |
 | up to 3 | less than twice an easy proof (`EASY_SECONDS`, `EASY_SHARE`) | the learned search |
 | more | none | `propose`, the learned search until it has settled, then `BRIEF_WORK` of the exact search |
-| more | up to `ALL_LEARNED` seconds a point, at most `MOST_LEARNED`, and no gap asked for | the learned search |
-| more | more | `propose` and the learned search, at most `LONG_SHARE` of the time; then the exact search |
+| more | up to `ALL_LEARNED` seconds a point and `MOST_LEARNED`, no gap asked | the learned search, in between a proof |
+| more | more | `propose`, the learned search until it has settled, at most `LONG_SHARE` of the time; the exact search |
+
+A proof in between: where the learned search has settled, the exact search gets the time that it seems to need
+(`reckoned_proof`), if that is there, and the learned search the rest. Where there is more time, and a proof seems out
+of reach all the same, the learned search goes on, and the exact search gets `BOUND_SHARE` for a bound.
 """
 
 from __future__ import annotations
@@ -43,6 +47,18 @@ EASY_SECONDS, EASY_SHARE = 1e-6, 0.5
 #: With more than three parameters no proof is attempted in so little time, in seconds a point: what it would find or
 #: prove is less than what the learned search still gains.
 ALL_LEARNED = 2e-4
+
+#: Seconds of a proof beyond three parameters, times the points squared, and the factor for each further tenth of
+#: outliers. Measured with eight parameters, N = 100 to 1000 and 10 to 50%: hyperplanes take a 20th to once that,
+#: fundamental matrices once to three times, some in the chart F32 = 1 far more.
+PROOF_RATE, PROOF_GROWTH = 5e-9, 10.0
+
+#: In little time a proof is tried where it is reckoned to take at most this share of what is left. It gets up to that,
+#: and up to so many times as long as was reckoned: beyond, it seldom ends.
+PROOF_SHARE, PROOF_TIMES = 0.6, 5.0
+
+#: In more time, where a proof seems out of reach, the last part of it goes to a bound.
+BOUND_SHARE = 0.25
 
 #: However many points there are, a proof is attempted in more time than this, in seconds, or where a gap is asked for.
 MOST_LEARNED = 1.0
@@ -80,7 +96,7 @@ def auto(task: Task, *, n_jobs: int = -1) -> Iterator[Step]:
             return prove(task, n_jobs=n_jobs)
         return _short(task, left)
     if task.gap == 0 and left <= min(ALL_LEARNED * task.problem.n_points, MOST_LEARNED):
-        return learned(task)
+        return _learned_and_proof(task)
     return _long(task, left, n_jobs)
 
 
@@ -97,6 +113,28 @@ def _short(task: Task, left: float) -> Iterator[Step]:
         yield from prove(task)
     else:
         yield from learned(task)
+
+
+def _learned_and_proof(task: Task) -> Iterator[Step]:
+    """Search by learning; where few points are left out, stop once for a proof, which then takes no longer."""
+    N = task.problem.n_points
+    best, belief = np.zeros(N, dtype=np.bool_), np.full(N, 0.5)
+    for step in learned(task, belief_out=belief):
+        best = best if step.subset is None else step.subset
+        yield step
+        if step.settled:
+            left, reckoned = task.seconds_left(), reckoned_proof(best)
+            if reckoned <= PROOF_SHARE * left:
+                spent = left - min(PROOF_SHARE * left, PROOF_TIMES * reckoned)
+                yield from exact_partition(
+                    replace(task, deadline=task.deadline - spent), start=best, belief=belief, n_jobs=1
+                )
+
+
+def reckoned_proof(inliers: NDArray[np.bool_]) -> float:
+    """Return about how many seconds it takes to prove, beyond three parameters, that a set is the largest."""
+    N = len(inliers)
+    return float(PROOF_RATE * N**2 * PROOF_GROWTH ** (10.0 * (1.0 - np.count_nonzero(inliers) / N)))
 
 
 def _proof_seconds(n_points: int, inlier_share: float) -> float:
@@ -117,6 +155,11 @@ def _long(task: Task, left: float, n_jobs: int) -> Iterator[Step]:
             yield Step(subset=(best := _refined(task, best)), refined=True)
             break
     if np.isfinite(left):
+        if reckoned_proof(best) > task.seconds_left() > BOUND_SHARE * left:
+            for step in learned(replace(task, deadline=task.deadline - BOUND_SHARE * left), belief_out=belief):
+                if step.subset is not None and np.count_nonzero(step.subset) > np.count_nonzero(best):
+                    best = step.subset
+                yield step
         yield from exact_partition(task, start=best, belief=belief, n_jobs=n_jobs)
     else:
         yield from exact_partition(task, start=best, belief=belief, n_jobs=1, max_work=BRIEF_WORK)
