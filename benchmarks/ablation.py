@@ -42,8 +42,9 @@ from maxcon.agent import peel_features, point_features  # noqa: E402
 from maxcon.agent.perceptron import Perceptron, perceptron  # noqa: E402
 from maxcon.agent.search_networks import SearchNetworks, shipped_search_networks  # noqa: E402
 from maxcon.experiments import self_imitation  # noqa: E402
+from maxcon.experiments.played_fits import Recorder, best_known  # noqa: E402
 from maxcon.experiments.search_instances import FAMILIES, Ranges, draw_problem, make_problem  # noqa: E402
-from maxcon.experiments.self_imitation import Learner, Recipe, Recorder, best_known, train_search_networks  # noqa: E402
+from maxcon.experiments.self_imitation import Learner, Recipe, train_search_networks  # noqa: E402
 from maxcon.minimax.clock import processor_time  # noqa: E402
 from maxcon.search.anytime import make_task  # noqa: E402
 from maxcon.search.learned import learned  # noqa: E402

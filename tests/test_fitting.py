@@ -13,6 +13,7 @@ import maxcon
 import maxcon.fitting
 from instances import FAMILIES
 from maxcon.datasets.synthetic import synthetic_hyperplane
+from maxcon.minimax import jit
 from maxcon.minimax.jit import compile_seconds, working_clock
 from maxcon.search.anytime import Progress, Step, make_task, run
 from maxcon.search.conclusion import conclude
@@ -306,3 +307,19 @@ def test_ctrl_c_while_a_kernel_is_waited_for_does_not_stop_the_clock():
     time.sleep(0.05)
     assert working_clock() - clock >= 0.05
     assert compile_seconds() == before
+
+
+def test_progress_counts_the_seconds_that_the_result_counts(monkeypatch):
+    """Not those of kernels that are compiled or loaded on the way, as if one were here."""
+
+    def slow(task):
+        time.sleep(0.02)
+        monkeypatch.setattr(jit._making, "seconds", jit._making.seconds + 0.02)
+        yield Step(subset=np.isin(np.arange(task.problem.n_points), [0, 1]))
+
+    monkeypatch.setattr("maxcon.search.removal.random_removal", slow)
+    told = []
+    problem = maxcon.line(np.arange(5.0), np.arange(5.0) ** 2)
+    result = maxcon.fit(problem, 0.1, method="random", callback=lambda progress: told.append(progress.seconds))
+    assert told
+    assert 0.0 <= told[-1] <= result.seconds

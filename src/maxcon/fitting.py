@@ -43,7 +43,7 @@ class MethodEntry:
 METHODS: dict[str, MethodEntry] = {
     "auto": MethodEntry(
         "maxcon.search.portfolio:auto",
-        "exact for d <= 3; else the learned search, then the exact search for as long as there is time",
+        "exact for d <= 3, where the time allows; else the learned search, then the exact search",
     ),
     "agent": MethodEntry(
         "maxcon.search.agent_removal:agent_removal",

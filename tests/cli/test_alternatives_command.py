@@ -54,7 +54,7 @@ def test_json_and_limit(run, stars):
     result = run(*args)
     assert f"({expected.n_found - 10} more; --json lists them)" in result.stdout
     few = run(*args, "--limit", 3, "--json", "a.json")
-    assert "3 found, there may be more" in few.stdout
+    assert "3 found, there may be more (--limit ended the list)" in few.stdout
     assert "wrote a.json" in few.stdout
     with open("a.json", encoding="utf-8") as file:
         record = json.load(file)

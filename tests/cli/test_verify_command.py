@@ -1,15 +1,20 @@
 import json
 import os
 import signal
+import sys
 import threading
 import time
+from contextlib import suppress
+from types import ModuleType
 
 import numpy as np
 import pytest
+import scipy.optimize
 
 import maxcon
 from maxcon.certification import issue, save
 from maxcon.certification.certificate import dumps
+from maxcon.certification.rerun import solver_at_work
 from maxcon.search.anytime import make_task
 from maxcon.search.witness import make_witness
 
@@ -123,14 +128,42 @@ def test_ctrl_c_ends_a_rerun(run, tmp_path, monkeypatch):
         signal.pthread_kill(threading.main_thread().ident, signal.SIGINT)
         done.wait(10)
 
+    at_exit, ended = [], []
     monkeypatch.setattr("scipy.optimize.milp", solver)
+    monkeypatch.setattr("atexit.register", at_exit.append)
+    monkeypatch.setattr("os._exit", ended.append)
     began = time.monotonic()
     result = run("verify", "bare.json", "p.npy", "--rerun")
     assert time.monotonic() - began < 9
+    (leave,) = at_exit
+    leave()
+    assert ended == [130]  # at once: HiGHS ending in the middle of the interpreter's end would abort the process
     done.set()
+    while solver_at_work():
+        time.sleep(0.01)
+    leave()
+    assert ended == [130]  # nobody is at work: the usual end
     assert result.exit_code == 130
     assert "accepted" in result.stdout
     assert "not proven by the file (nor by the rerun: stopped by Ctrl-C)" in " ".join(result.stdout.split())
+
+
+@pytest.mark.usefixtures("certificate")
+@pytest.mark.skipif(os.name != "posix", reason="sends SIGINT")
+def test_ctrl_c_while_the_solver_is_loaded(run, points, monkeypatch):
+    """Extension modules swallow it, as this one does."""
+
+    class Solvers(ModuleType):
+        def __getattr__(self, name):
+            with suppress(KeyboardInterrupt):
+                signal.pthread_kill(threading.main_thread().ident, signal.SIGINT)
+            return getattr(scipy.optimize, name)
+
+    monkeypatch.setitem(sys.modules, "scipy.optimize", Solvers("scipy.optimize"))
+    result = run("verify", "bare.json", points, "--rerun")
+    assert result.exit_code == 130
+    assert "interrupted" in result.stderr
+    assert "claim" not in result.stdout
 
 
 def test_a_header_of_numbers(run, tmp_path):

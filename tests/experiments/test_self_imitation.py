@@ -5,18 +5,14 @@ import pytest
 
 from maxcon.agent.perceptron import random_perceptron
 from maxcon.agent.search_networks import PEEL_WIDTHS, POINT_WIDTHS, SearchNetworks, load_search_networks
+from maxcon.experiments.played_fits import WIDEST_BASIS, Recorder, Records, best_known, random_settings
 from maxcon.experiments.search_instances import FAMILIES, Ranges, draw_problem, make_problem
 from maxcon.experiments.self_imitation import (
-    WIDEST_BASIS,
     Learner,
     Recipe,
-    Recorder,
-    Records,
-    best_known,
     held_out_gaps,
     peel_loss,
     point_loss,
-    random_settings,
     train_search_networks,
 )
 from maxcon.search.anytime import make_task
@@ -54,7 +50,7 @@ def test_what_is_recorded_is_labelled_by_the_best_set():
     label = best_known(problem, threshold, 200, rng, None, 0)
     recorder = Recorder()
     task = make_task(problem, threshold, rng)
-    settings = check_settings(random_settings(rng, SMALL))._replace(reach=4.0)
+    settings = check_settings(random_settings(rng, SMALL.explore))._replace(reach=4.0)
     known, found = recorder.fit(task, untrained(), label, settings, 3)
     assert known == label.sum()
     records = recorder.records()

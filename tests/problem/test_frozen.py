@@ -1,12 +1,15 @@
-"""Nobody changes the arrays of a result."""
+"""Nobody changes the arrays of a result, nor those of its copies."""
 
+import copy
+import pickle
 from dataclasses import fields, replace
 
 import numpy as np
 import pytest
 
 import maxcon
-from maxcon.datasets import synthetic_two_view
+from maxcon.certification import issue
+from maxcon.datasets import load_table, synthetic_two_view
 
 
 def results():
@@ -21,20 +24,55 @@ def results():
     yield from (maxcon.alternative_optima(problem, 0.1), maxcon.consensus_curve(problem), replace(found, seconds=0.0))
     yield maxcon.fit(maxcon.LinearProblem(np.zeros((3, 1)), np.ones(3)), 0.1)  # infeasible
     pair = maxcon.find_fundamental(scene.x1, scene.x2, threshold=0.1)
-    yield from (pair, pair.consensus)
+    yield from (pair, pair.consensus, pair.problem, problem, issue(problem, found), load_table("cyg_ob1"))
 
 
-def test_arrays_of_results_are_read_only():
+KINDS = {
+    "AlternativeOptima",
+    "Certificate",
+    "Consensus",
+    "ConsensusCurve",
+    "Explanation",
+    "FundamentalFit",
+    "FundamentalProblem",
+    "LinearProblem",
+    "MinimaxFit",
+    "Table",
+}
+
+
+def unpickled(result):
+    return pickle.loads(pickle.dumps(result))
+
+
+@pytest.mark.parametrize("copied", [lambda result: result, copy.copy, copy.deepcopy, unpickled])
+def test_arrays_of_results_and_of_their_copies_are_read_only(copied):
     kinds = set()
     for result in results():
-        arrays = [value for each in fields(result) if isinstance(value := getattr(result, each.name), np.ndarray)]
-        assert arrays
-        for array in arrays:
+        same = copied(result)
+        assert type(same) is type(result)
+        kinds.add(type(result).__name__)
+        found = 0
+        for each in fields(result):
+            array, before = getattr(same, each.name), getattr(result, each.name)
+            if not isinstance(before, np.ndarray):
+                continue
+            found += 1
+            assert np.array_equal(array, before, equal_nan=before.dtype.kind == "f")
             assert not array.flags.writeable
             with pytest.raises(ValueError, match="read-only"):
                 array[...] = 0
-        kinds.add(type(result).__name__)
-    assert kinds == {"Consensus", "Explanation", "MinimaxFit", "AlternativeOptima", "ConsensusCurve", "FundamentalFit"}
+        assert found
+    assert kinds == KINDS
+
+
+def test_what_a_copy_of_a_result_holds_is_read_only_too():
+    consensus = next(results())
+    for same in (copy.deepcopy(consensus), unpickled(consensus)):
+        assert same.problem is not consensus.problem
+        assert not same.problem.A.flags.writeable
+        assert not same.problem.b.flags.writeable
+        assert same.explain(0).lost == consensus.explain(0).lost
 
 
 def test_what_was_passed_in_stays_as_it_was():

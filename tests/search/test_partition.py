@@ -213,8 +213,12 @@ def test_options() -> None:
     task = task_for(np.eye(5, 4), np.zeros(5), 1.0)
     with pytest.raises(ValueError, match=r"start must be a boolean mask of shape \(5,\), but it is int"):
         exact_partition(task, start=np.zeros(5, dtype=np.int64))  # type: ignore[arg-type]
-    for belief in (np.zeros(4), np.full(5, 1.5), np.full(5, np.nan)):
-        with pytest.raises(ValueError, match=r"belief must be probabilities of shape \(5,\)"):
+    with pytest.raises(ValueError, match=r"^belief must have the shape \(5,\), but its shape is \(4,\)$"):
+        exact_partition(task, belief=np.zeros(4))
+    for wrong in (1.5, -0.25, np.nan):
+        belief = np.array([0.0, 1.0, 0.5, wrong, wrong])
+        said = rf"^belief must be probabilities from 0 to 1, but 2 of .* are not; the first is {wrong} at belief\[3\]$"
+        with pytest.raises(ValueError, match=said):
             exact_partition(task, belief=belief)
     with pytest.raises(ValueError, match="leaf must be at least 1, but it is 0"):
         exact_partition(task, leaf=0)
@@ -225,6 +229,40 @@ def test_options() -> None:
 
 
 # ----------------------------------------------------------------------------------------------- the parts
+
+
+def test_improbable_points_come_first_and_small_residuals_are_told_apart() -> None:
+    """Whitened residuals are relative to the largest |b|, here that of one point: the others' are below 1e-16."""
+    rng = np.random.default_rng(0)
+    A, b = rng.standard_normal((40, 4)), 1e-18 * rng.standard_normal(40)
+    b[0] = 1.0
+    task = task_for(A, b, 1e-3)
+    start = np.arange(40) > 0
+    belief = rng.random(40)
+    search = PartitionSearch(task, start=start, belief=belief, n_jobs=1)
+    assert [step.upper_bound for step in search.steps()][-1] == 39
+    assert search._tree is not None
+    rank = np.empty(40)
+    rank[search._tree.order] = search._states[0].rank
+    residuals = search._residuals_of_fit(start)
+    assert 0 < np.sort(residuals)[-2] < 1e-16
+    probable = belief > 0.5
+    expected = np.lexsort((np.where(probable, -belief, residuals), ~probable))
+    assert np.array_equal(np.argsort(rank, kind="stable"), expected)
+    assert rank.min() > -1.0  # as branching takes it
+
+
+def test_the_unit_of_the_data_does_not_matter() -> None:
+    """The rows are whitened: not even that of b alone."""
+    A, b = synthetic(np.random.default_rng(3), 60, 4, 0.3)
+    belief = np.random.default_rng(4).random(60)
+    nodes = []
+    for unit in (1.0, 2.0**-66, 2.0**66):
+        search = PartitionSearch(task_for(A, unit * b, 0.1 * unit), belief=belief, n_jobs=1)
+        list(search.steps())
+        nodes.append((search.expanded, search.least_outliers, search.n_outliers))
+    assert nodes[0] == nodes[1] == nodes[2]
+    assert nodes[0][0] > 0
 
 
 @pytest.mark.parametrize(("N", "leaf"), [(1, 1), (7, 3), (100, 17), (1000, 20), (33, 100)])

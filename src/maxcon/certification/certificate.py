@@ -113,6 +113,18 @@ class Certificate:
     package: str
     groups: tuple[Group, ...]
 
+    def __post_init__(self) -> None:
+        self._freeze_arrays()
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        vars(self).update(state)  # a pickle and a deep copy bring arrays back writeable
+        self._freeze_arrays()
+
+    def _freeze_arrays(self) -> None:
+        """Make the arrays read-only, as those of results are, but by code of its own: the checker shares none."""
+        self.model.setflags(write=False)
+        self.inlier_mask.setflags(write=False)
+
     @property
     def proven_bound(self) -> int:
         """What the file proves: N minus all points that its groups need."""

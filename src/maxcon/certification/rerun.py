@@ -31,6 +31,9 @@ MOST_SUBSETS = 20_000
 #: A d-subset whose matrix has a larger condition number confines nothing.
 SINGULAR = 1e10
 
+#: The name of the thread in which HiGHS works.
+SOLVER = "maxcon rerun"
+
 #: Seconds between two looks at whether Ctrl-C was pressed, where waiting would not be cut short by it.
 LOOK = 0.1
 
@@ -85,7 +88,7 @@ def prove_again(A: Floats, b: Floats, limit: float, bound: int, time_limit: floa
     -------
     Rerun
         "unfinished" where the time is over, or Ctrl-C was pressed: then a solver at work is left to its own, and ends
-        with the process or at its time limit.
+        with the process or at its time limit (`solver_at_work`).
     """
     began = time.perf_counter()
     d = A.shape[1]
@@ -102,6 +105,20 @@ def prove_again(A: Floats, b: Floats, limit: float, bound: int, time_limit: floa
     except KeyboardInterrupt:
         return Rerun("unfinished", solver, "stopped by Ctrl-C", 0, time.perf_counter() - began)
     return Rerun("refuted" if found else "confirmed", solver, "", found, time.perf_counter() - began)
+
+
+def load_solver() -> None:
+    """Import what a rerun needs ahead of it: extension modules may swallow a Ctrl-C that meets their import."""
+    from scipy.optimize import linprog, milp  # noqa: F401, PLC0415  (only a rerun needs them)
+
+
+def solver_at_work() -> bool:
+    """Whether a solver that Ctrl-C has left to its own is still at work.
+
+    It cannot be told to stop. Should it end while the interpreter is being taken down, its thread would abort the
+    process, with a core dump: a program that ends nevertheless had better do so by `os._exit`.
+    """
+    return any(thread.name == SOLVER for thread in threading.enumerate())
 
 
 # ------------------------------------------------------------------------------------------------- two
@@ -249,7 +266,7 @@ def _interruptible(function: Callable[[], T]) -> T:
         except BaseException as error:  # for the caller, whatever it is
             raised.append(error)
 
-    thread = threading.Thread(target=work, daemon=True)
+    thread = threading.Thread(target=work, name=SOLVER, daemon=True)
     thread.start()
     while thread.is_alive():
         thread.join(LOOK)

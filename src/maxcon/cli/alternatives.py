@@ -78,7 +78,7 @@ def command(
         write_output(json_out, result_json(about, answer))
     if json_out != "-":
         notes = ["compiling not counted"] * bool(compilations.buffer) + ["stopped by Ctrl-C"] * interrupted.is_set()
-        _show(answer, names, f"{model} through {table.source}, threshold {threshold:g}", notes)
+        _show(answer, names, f"{model} through {table.source}, threshold {threshold:g}", limit, notes)
         if json_out is not None:
             click.echo(f"wrote {json_out}")
     if interrupted.is_set():
@@ -98,7 +98,7 @@ def _search(problem: LinearProblem, threshold: float, limit: int, time_limit: fl
             return alternative_optima(problem, threshold, limit=limit, time_limit=time_limit, callback=show)
 
 
-def _show(answer: AlternativeOptima, names: Sequence[str], heading: str, notes: list[str]) -> None:
+def _show(answer: AlternativeOptima, names: Sequence[str], heading: str, limit: int, notes: list[str]) -> None:
     out = console()
     out.print(Text(heading, style="bold"))
     N = answer.masks.shape[1]
@@ -109,7 +109,7 @@ def _show(answer: AlternativeOptima, names: Sequence[str], heading: str, notes: 
     else:
         text = f"{size}not proven to be the largest: at most {answer.upper_bound} are possible"
         table.add_row("consensus", Text(text, style="yellow"))
-    table.add_row("sets", _sets(answer))
+    table.add_row("sets", _sets(answer, limit))
     for label, mask in (("in all", answer.in_all), ("in none", answer.in_none), ("varying", answer.varying)):
         table.add_row(label, rows(mask))
     if answer.unknown.any():
@@ -123,13 +123,14 @@ def _show(answer: AlternativeOptima, names: Sequence[str], heading: str, notes: 
         out.print(f"({answer.n_found - SHOWN} more; --json lists them)")
 
 
-def _sets(answer: AlternativeOptima) -> Text:
+def _sets(answer: AlternativeOptima, limit: int) -> Text:
     if answer.n_inliers == 0:
         return Text("none: no model explains even one point within the threshold", style="red")
     if not answer.proven:
         return Text("not looked for: first the largest consensus must be proven, which takes more time", style="yellow")
     if not answer.complete:
-        return Text(f"{answer.n_found} found, there may be more", style="yellow")
+        why = " (--limit ended the list)" if answer.n_found >= limit else ""
+        return Text(f"{answer.n_found} found, there may be more{why}", style="yellow")
     return Text("one only" if answer.n_found == 1 else f"{answer.n_found}, no others", style="green")
 
 

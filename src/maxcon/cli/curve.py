@@ -33,7 +33,14 @@ SHOWN = 20
 
 @click.command(name="curve", short_help="Show the largest consensus for every threshold.")
 @table_options
-@click.option("--from", "low", type=float, default=0.0, metavar="E", help="The smallest threshold.  [default: 0]")
+@click.option(
+    "--from",
+    "low",
+    type=click.FloatRange(min=0),
+    default=0.0,
+    metavar="E",
+    help="The smallest threshold.  [default: 0]",
+)
 @click.option("--to", "high", type=float, metavar="E", help="The largest threshold.  [default: that of all points]")
 @click.option("--time-limit", type=float, metavar="SECONDS", help="Stop then with what is known so far.")
 @click.option("--json", "json_out", metavar="OUT", help="Write the curve as JSON; - is standard output.")
@@ -69,6 +76,8 @@ def command(
     """
     if json_out == "-" and plot_out == "-":
         raise Failure("--json and --plot cannot both go to standard output")
+    if high is not None and not low < high:
+        raise Failure(f"--from must be less than --to, but they are {low:g} and {high:g}")
     if json_out is not None:
         check_output(json_out, "--json")
     if plot_out is not None:
@@ -126,7 +135,8 @@ def _show(curve: ConsensusCurve, heading: str, notes: list[str]) -> None:
     if curve.complete:
         about.add_row("proof", Text("proven: no model does better at any of these thresholds", style="green"))
     else:
-        about.add_row("proof", Text("not all proven: at most as many points as the last column says", style="yellow"))
+        text = 'not all proven: more than "consensus" may be possible, up to "at most"'
+        about.add_row("proof", Text(text, style="yellow"))
     about.add_row("time", ", ".join([duration(curve.seconds), *notes]))
     out.print(about)
     if len(curve.counts) > 0:

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from maxcon.problem import LinearProblem, line
+from maxcon.problem import LinearProblem, ReadOnlyArrays, line
 
 
 class _About(NamedTuple):
@@ -55,7 +55,7 @@ TABLES: tuple[str, ...] = tuple(_ABOUT)
 
 
 @dataclass(frozen=True, eq=False)
-class Table:
+class Table(ReadOnlyArrays):
     """A table of points (x, y) with what is needed to plot and to fit it.
 
     Attributes
@@ -110,8 +110,6 @@ def load_table(name: str) -> Table:
         columns = np.loadtxt(stream, dtype=np.float64, comments="#", delimiter=",", ndmin=2, unpack=True)
     # Copies, because the rows of `columns` are strided views of one array that could still be written to.
     x, y = (np.array(column, order="C") for column in columns)
-    x.setflags(write=False)
-    y.setflags(write=False)
     return Table(name=name, x=x, y=y, **_ABOUT[name]._asdict())
 
 

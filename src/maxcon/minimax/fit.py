@@ -10,11 +10,11 @@ from numpy.typing import ArrayLike, NDArray
 from maxcon.minimax.linear import OK, basis_points, cold_fit
 from maxcon.minimax.rows import linear_rows, whiten
 from maxcon.minimax.workspace import allocate
-from maxcon.problem import LinearProblem, check_indices, freeze_arrays
+from maxcon.problem import LinearProblem, ReadOnlyArrays, check_indices
 
 
 @dataclass(frozen=True, eq=False)
-class MinimaxFit:
+class MinimaxFit(ReadOnlyArrays):
     """The Chebyshev fit of a set of points S (paper, equation 4).
 
     Attributes
@@ -31,9 +31,6 @@ class MinimaxFit:
     model: NDArray[np.float64]
     value: float
     basis: NDArray[np.int64]
-
-    def __post_init__(self) -> None:
-        freeze_arrays(self)
 
 
 def minimax_fit(problem: LinearProblem, subset: ArrayLike | None = None) -> MinimaxFit:

@@ -2,7 +2,7 @@
 
 from maxcon.problem.consensus import Consensus, Status
 from maxcon.problem.explanation import Explanation
-from maxcon.problem.frozen import freeze_arrays
+from maxcon.problem.frozen import ReadOnlyArrays
 from maxcon.problem.linear import LinearProblem, hyperplane, line, plane
 from maxcon.problem.protocol import Problem
 from maxcon.problem.tolerance import inlier_slack
@@ -13,11 +13,11 @@ __all__ = [
     "Explanation",
     "LinearProblem",
     "Problem",
+    "ReadOnlyArrays",
     "Status",
     "check_indices",
     "check_model",
     "check_threshold",
-    "freeze_arrays",
     "hyperplane",
     "inlier_slack",
     "line",

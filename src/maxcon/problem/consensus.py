@@ -10,14 +10,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from maxcon.problem.explanation import Explanation
-from maxcon.problem.frozen import freeze_arrays
+from maxcon.problem.frozen import ReadOnlyArrays
 from maxcon.problem.linear import LinearProblem
 
 Status = Literal["optimal", "bounded", "heuristic", "infeasible"]
 
 
 @dataclass(frozen=True, eq=False)
-class Consensus:
+class Consensus(ReadOnlyArrays):
     """A model, the points that it explains within the threshold, and how good that is.
 
     Its arrays are read-only.
@@ -70,9 +70,6 @@ class Consensus:
     seed: int | None
     seconds: float
     problem: LinearProblem = field(repr=False)
-
-    def __post_init__(self) -> None:
-        freeze_arrays(self)
 
     def explain(self, point: int, *, time_limit: float | None = 10.0) -> Explanation:
         """Explain why a point is no inlier: which inliers speak against it, and what it would cost to force it in.

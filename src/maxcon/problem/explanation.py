@@ -7,11 +7,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from maxcon.problem.frozen import freeze_arrays
+from maxcon.problem.frozen import ReadOnlyArrays
 
 
 @dataclass(frozen=True, eq=False)
-class Explanation:
+class Explanation(ReadOnlyArrays):
     """Why a point is no inlier.
 
     Attributes
@@ -35,6 +35,3 @@ class Explanation:
     consensus_with_point: int
     lost: int
     proven: bool
-
-    def __post_init__(self) -> None:
-        freeze_arrays(self)

@@ -7,12 +7,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from maxcon.problem.frozen import ReadOnlyArrays
 from maxcon.problem.tolerance import inlier_slack
 from maxcon.problem.validate import check_array, check_model
 
 
 @dataclass(frozen=True, eq=False, init=False)
-class LinearProblem:
+class LinearProblem(ReadOnlyArrays):
     """Points with the residual ``|A[i] @ model - b[i]|`` (paper, section 2.1).
 
     Parameters
@@ -48,18 +49,18 @@ class LinearProblem:
         if values.shape != (n_points,):
             raise ValueError(f"b must have one entry for each row of A, ({n_points},), but its shape is {values.shape}")
         _check_enough_points(n_points, n_params, "A")
-        self._freeze(rows, values, "linear")
+        self._set(rows, values, "linear")
 
-    def _freeze(self, A: NDArray[np.float64], b: NDArray[np.float64], family: str) -> None:
-        A.setflags(write=False)
+    def _set(self, A: NDArray[np.float64], b: NDArray[np.float64], family: str) -> None:
         for name, value in (("A", A), ("b", b), ("family", family)):
             object.__setattr__(self, name, value)
+        self._freeze_arrays()
 
     @classmethod
     def _checked(cls, A: NDArray[np.float64], b: NDArray[np.float64], family: str) -> LinearProblem:
         """Build from arrays that a builder of this file has checked already."""
         problem = cls.__new__(cls)
-        problem._freeze(A, b, family)
+        problem._set(A, b, family)
         return problem
 
     @property

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from maxcon.minimax import allocate, linear_rows, minimax_fit
 from maxcon.minimax.jit import working_clock
 from maxcon.minimax.linear import OK, cold_fit
-from maxcon.problem import Consensus, LinearProblem, check_threshold, freeze_arrays
+from maxcon.problem import Consensus, LinearProblem, ReadOnlyArrays, check_threshold
 from maxcon.problem.validate import check_callback, check_time_limit
 from maxcon.search.alternative_kernels import (
     DONE,
@@ -49,7 +49,7 @@ STABBED = 3
 
 
 @dataclass(frozen=True, eq=False)
-class AlternativeOptima:
+class AlternativeOptima(ReadOnlyArrays):
     """The largest consensus sets of a problem.
 
     A largest consensus set is a set of points with f(S) within the threshold (with the package's slack for rounding)
@@ -97,9 +97,6 @@ class AlternativeOptima:
     varying: NDArray[np.bool_]
     threshold: float
     seconds: float
-
-    def __post_init__(self) -> None:
-        freeze_arrays(self)
 
     @property
     def n_found(self) -> int:

@@ -120,6 +120,17 @@ def exact_partition(
     return PartitionSearch(task, start=start, belief=belief, leaf=leaf, n_jobs=n_jobs, max_work=max_work).steps()
 
 
+def _check_belief(belief: NDArray[np.float64], n_points: int) -> None:
+    if np.shape(belief) != (n_points,):
+        raise ValueError(f"belief must have the shape ({n_points},), but its shape is {np.shape(belief)}")
+    wrong = np.flatnonzero(~((belief >= 0.0) & (belief <= 1.0)))
+    if wrong.size > 0:
+        raise ValueError(
+            f"belief must be probabilities from 0 to 1, but {wrong.size} of its {n_points} entries are not; "
+            f"the first is {belief[wrong[0]]} at belief[{wrong[0]}]"
+        )
+
+
 class _SpentError(Exception):
     """The work or the memory allowed is spent."""
 
@@ -155,8 +166,8 @@ class PartitionSearch:
             raise ValueError(
                 f"start must be a boolean mask of shape ({n_points},), but it is {start.dtype} of shape {start.shape}"
             )
-        if belief is not None and (belief.shape != (n_points,) or not ((belief >= 0.0) & (belief <= 1.0)).all()):
-            raise ValueError(f"belief must be probabilities of shape ({n_points},), but it is {belief!r}")
+        if belief is not None:
+            _check_belief(belief, n_points)
         if leaf is not None and leaf < 1:
             raise ValueError(f"leaf must be at least 1, but it is {leaf}")
         self.task = task
@@ -250,7 +261,8 @@ class PartitionSearch:
         assert self._tree is not None
         rank = residuals
         if self._belief is not None:
-            rank = np.where(self._belief > 0.5, 1.0 - self._belief, 1.0 + residuals)
+            # Neither is rounded: added to 1, small residuals would be.
+            rank = np.where(self._belief > 0.5, -0.5 * self._belief, residuals)
         for state in self._states:
             state.rank[:] = rank[self._tree.order]
             state.models[-1, 0] = ~self.inliers[self._tree.order]

@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from maxcon.minimax import linear_rows, minimax_fit
 from maxcon.minimax.jit import working_clock
-from maxcon.problem import LinearProblem, freeze_arrays, inlier_slack
+from maxcon.problem import LinearProblem, ReadOnlyArrays, inlier_slack
 from maxcon.problem.tolerance import ABSOLUTE_SLACK, RELATIVE_SLACK
 from maxcon.problem.validate import check_number, check_time_limit
 from maxcon.search.anytime import Step, Task, make_task, run
@@ -31,7 +31,7 @@ LEAST_BEND, WINDOW, SMALL_GROWTH = 2.0, 0.1, float(np.log(1.02))
 
 
 @dataclass(frozen=True, eq=False)
-class ConsensusCurve:
+class ConsensusCurve(ReadOnlyArrays):
     """The most inliers that a model can have, for each threshold of a range.
 
     The consensus reaches k at the smallest f(S) of all sets S of k points: the k-th breakpoint. Breakpoints are
@@ -75,9 +75,6 @@ class ConsensusCurve:
     scale: float
     complete: bool
     seconds: float
-
-    def __post_init__(self) -> None:
-        freeze_arrays(self)
 
     def consensus(self, threshold: ArrayLike) -> Any:
         """Return the largest consensus at each threshold (the largest known, where the curve is not complete).

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from maxcon.datasets.cameras import epipolar_rows, hartley_transform, transformed
-from maxcon.problem import LinearProblem, check_threshold
+from maxcon.problem import LinearProblem, ReadOnlyArrays, check_threshold
 from maxcon.problem.validate import check_model
 from maxcon.search.sampling import check_count
 from maxcon.vision.epipolar import check_matches, check_matrix
@@ -32,7 +32,7 @@ SAMPLES = 20_000
 
 
 @dataclass(frozen=True, eq=False)
-class FundamentalProblem:
+class FundamentalProblem(ReadOnlyArrays):
     """Matches as linear residuals: `problem`, and the way back from its parameters to a matrix in pixels.
 
     A row of the nine products of a match ``phi = [x'x, x'y, x', y'x, y'y, y', x, y, 1]`` of normalised coordinates
@@ -190,8 +190,6 @@ def fundamental_problem(
         directions = np.delete(np.eye(9), one, axis=1)
         problem = LinearProblem(np.delete(rows, one, axis=1), -rows[:, one])
     problem = LinearProblem._checked(problem.A, problem.b, FAMILIES[chart])
-    for array in (T1, T2, base, directions):
-        array.setflags(write=False)
     return FundamentalProblem(problem, chart, T1, T2, base, directions)
 
 

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from maxcon.datasets.cameras import epipolar_rows, transformed
 from maxcon.fitting import fit
 from maxcon.minimax.jit import working_clock
-from maxcon.problem import Consensus, check_threshold, freeze_arrays
+from maxcon.problem import Consensus, ReadOnlyArrays, check_threshold
 from maxcon.problem.validate import check_time_limit
 from maxcon.search.anytime import Progress
 from maxcon.vision.degeneracy import Degeneracy, degeneracy
@@ -45,7 +45,7 @@ _SAMPLING, _POLISH = 0.5, 1.5e-6
 
 
 @dataclass(frozen=True, eq=False)
-class FundamentalFit:
+class FundamentalFit(ReadOnlyArrays):
     """A fundamental matrix with the consensus that it rests on.
 
     Attributes
@@ -76,9 +76,6 @@ class FundamentalFit:
     sampson: NDArray[np.float64]
     symmetric: NDArray[np.float64]
     pixels: float | None
-
-    def __post_init__(self) -> None:
-        freeze_arrays(self)
 
     @property
     def chart(self) -> str:
