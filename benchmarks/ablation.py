@@ -121,8 +121,8 @@ def variants() -> dict[str, Variant]:
         # What lies within the limit of a model is feasible: nothing is removed, points are added back at once.
         "no walks down": Variant(shipped, settings._replace(reach=1.0)),
         "no variations": Variant(shipped, settings._replace(variations=0)),
-        "no forced points": Variant(shipped, settings._replace(forced=0.0)),
-        "only forced points": Variant(shipped, settings._replace(forced=1.0)),
+        "no points from outside": Variant(shipped, settings._replace(foreign=0)),
+        "all variations refined": Variant(shipped, settings._replace(straight=0.0)),
         "one proposal refined": Variant(shipped, settings._replace(refined=1)),
         "few samples": Variant(shipped, settings._replace(samples=10)),
         "nothing forgotten": Variant(shipped, settings._replace(patience=2**31 - 1)),

@@ -29,15 +29,29 @@ from maxcon.search.belief_proposals import MANY
 from maxcon.search.exact import exact
 from maxcon.search.learned import learned
 from maxcon.search.learned_kernels import (
+    BELIEVE,
     PARTS,
+    VARY,
     WALK_INCUMBENT,
     begin_search,
     begin_search_above,
     begin_search_belief,
     finish_search,
     play_parts,
+    take_model,
 )
-from maxcon.search.learned_memory import FLAGS_USED, FLOATS_USED, INTEGERS_USED, N_COUNTS, SIZE, allocate_arena, carve
+from maxcon.search.learned_memory import (
+    AGREEMENT,
+    FLAGS_USED,
+    FLOATS_USED,
+    INTEGERS_USED,
+    N_COUNTS,
+    PLACED,
+    SIZE,
+    STALL,
+    allocate_arena,
+    carve,
+)
 from maxcon.search.learned_settings import Settings
 from maxcon.search.random_kernels import seed_state
 from maxcon.search.refine import swap_refinement
@@ -315,6 +329,53 @@ def test_the_same_without_compilation():
         [sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=300, env=environment
     )
     assert found.stdout.strip() == str(sizes_by_round())
+
+
+def test_no_point_can_be_added_to_an_incumbent_that_has_its_vertex():
+    """So that a walk from it that keeps its points would find nothing."""
+    tested = 0
+    for name in sorted(BUILDERS):
+        for seed in range(6):
+            rng = np.random.default_rng([seed, 18])
+            A, b = BUILDERS[name](rng, 20, 3)
+            task = task_for(A, b, 0.05 * np.abs(b).max() + 1e-9, seed)
+            arena = arena_for(task)
+            begin_search(arena, task.limit)
+            play_rounds(arena, task.limit, Settings(), 3)
+            search = carve(arena)
+            if not search.counts[PLACED]:
+                continue
+            tested += 1
+            for i in np.flatnonzero(~search.member):
+                larger = search.member.copy()
+                larger[i] = True
+                assert minimax_fit(task.problem, larger).value > task.limit * task.rows.scale * (1 - 1e-9)
+    assert tested >= 20
+
+
+def test_variations_with_points_from_outside_lead_to_another_line():
+    rng = np.random.default_rng(19)
+    t = rng.uniform(-1, 1, 90)
+    height = np.repeat([0.0, 0.4, 0.0], [30, 50, 10])
+    b = 0.3 * t + height + rng.uniform(-0.05, 0.05, 90)
+    b[80:] += rng.choice([-1, 1], 10) * rng.uniform(1, 3, 10)
+    sizes = []
+    for foreign in (0, 4):
+        task = task_for(np.stack([t, np.ones(90)], axis=1), b, 0.06)
+        arena = arena_for(task)
+        begin_search(arena, task.limit)
+        search = carve(arena)
+        first = np.arange(90) < 30
+        search.x[:] = np.linalg.lstsq(task.rows.At[:, first].T, task.rows.b[first], rcond=None)[0]
+        take_model(search, task.limit)
+        assert 30 <= search.counts[SIZE] < 45
+        for _ in range(4):
+            search.counts[AGREEMENT], search.counts[STALL] = 1000, 1
+            play_parts(arena, task.limit, Settings(foreign=foreign), VARY, BELIEVE)
+        sizes.append(int(search.counts[SIZE]))
+        assert_feasible(task, search.member)
+    assert sizes[0] < 45
+    assert sizes[1] >= 50
 
 
 @compiled_only

@@ -14,7 +14,7 @@ from maxcon.minimax.jit import kernel
 from maxcon.minimax.linear import OK, cold_fit, compute_residuals
 from maxcon.search.belief import SHRINK, agreement, forget_votes, root_models, start_belief, update_belief
 from maxcon.search.belief_proposals import KEPT, propose, refine_proposals, same_model
-from maxcon.search.gnc_kernels import descend, write_weights
+from maxcon.search.gnc_kernels import descend
 from maxcon.search.learned_memory import (
     AGREEMENT,
     DOUBTS,
@@ -32,7 +32,7 @@ from maxcon.search.learned_memory import (
     carve,
 )
 from maxcon.search.learned_settings import Settings
-from maxcon.search.model_kernels import count_within, least_squares_model, weighted_model
+from maxcon.search.model_kernels import count_within, weighted_model
 from maxcon.search.peel_walk import choose_start, install_walk, walk_down
 from maxcon.search.random_kernels import draw_next, random_below, random_unit
 from maxcon.search.refine_kernels import refine_by, swap_kernel
@@ -196,7 +196,11 @@ def _is_new_start(search: Search, limit: float, x: NDArray[np.float64]) -> bool:
 
 @kernel
 def walk_part(search: Search, limit: float, settings: Settings, which: int) -> None:
-    """Walk from proposal 0 or 1, or (2) from the incumbent, unless that has been done."""
+    """Walk from proposal 0 or 1, or (2) from the incumbent, unless that has been done or cannot find more.
+
+    A loyal walk ends at a set that holds the incumbent. One that has its vertex has been refined: no point can be added
+    to it, so that no larger feasible set holds it.
+    """
     if which < 2:
         proposals, best = search.proposals, -1
         for k in range(KEPT):
@@ -209,7 +213,9 @@ def walk_part(search: Search, limit: float, settings: Settings, which: int) -> N
             walk_from(search, limit, settings, proposals.models[best], False)
     elif not search.counts[WALKED]:
         search.counts[WALKED] = 1
-        walk_from(search, limit, settings, search.x, settings.explore == 0.0)
+        loyal = settings.explore == 0.0
+        if not (loyal and search.counts[PLACED]):
+            walk_from(search, limit, settings, search.x, loyal)
 
 
 @kernel
@@ -218,53 +224,49 @@ def vary_part(search: Search, limit: float, settings: Settings) -> None:
     if search.counts[AGREEMENT] <= 1000.0 * settings.agreed:
         return
     for _ in range(settings.variations):
-        if random_unit(search.scratch.state) < settings.forced:
-            force_in(search, limit, settings)
-        else:
-            vary(search, limit, settings)
+        vary(search, limit, settings)
 
 
 @kernel
 def vary(search: Search, limit: float, settings: Settings) -> None:
-    """Walk from the least-squares model of a few of the incumbent's points."""
+    """Walk from the model of a few of the incumbent's points and some near it outside.
+
+    From that model itself, or from the local minimum that it leads to. Models of the incumbent's own points lead back
+    to it nearly always: the points outside are what leads elsewhere.
+    """
     ws, scratch, member = search.ws, search.scratch, search.member
-    d = search.x.shape[0]
-    size = 0
-    for i in range(member.shape[0]):
+    x, r, w = scratch.x, scratch.r, scratch.w
+    d, N = x.shape[0], member.shape[0]
+    # While there is progress, the next set is near and a descent not worth its time.
+    straight = search.counts[STALL] <= 0 or random_unit(scratch.state) < settings.straight
+    share = 2 if straight else 1  # a model that is not refitted must be nearer to a good one
+    few = share * d * (settings.least + random_below(scratch.state, max(settings.most - settings.least, 0) + 1))
+    compute_residuals(ws.At, ws.b, search.x, r)
+    size, others = 0, N
+    for i in range(N):  # members from the front, those outside from the back
+        w[i] = 0.0
         if member[i]:
             scratch.inliers[size] = i
             size += 1
-    few = d * (settings.least + random_below(scratch.state, max(settings.most - settings.least, 0) + 1))
+        elif share * abs(r[i]) <= settings.spread * limit:
+            others -= 1
+            scratch.inliers[others] = i
     few = min(few, size // 2)
-    if few <= d:
+    if few < d:
         return
     for k in range(few):
-        draw_next(scratch.state, scratch.inliers, k, size)
-    least_squares_model(ws.At, ws.b, scratch.inliers, few, scratch.table, scratch.x)
-    walk_from(search, limit, settings, scratch.x, False)
-
-
-@kernel
-def force_in(search: Search, limit: float, settings: Settings) -> None:
-    """Walk from a local minimum near the incumbent that is led through a point outside."""
-    ws, scratch, member = search.ws, search.scratch, search.member
-    x, r, w = scratch.x, scratch.r, scratch.w
-    compute_residuals(ws.At, ws.b, search.x, r)
-    size = 0
-    for i in range(member.shape[0]):
-        if not member[i] and abs(r[i]) <= settings.span * limit:
-            scratch.inliers[size] = i
-            size += 1
-    if size == 0:
-        return
-    point = scratch.inliers[random_below(scratch.state, size)]
-    control = settings.loose * settings.loose
-    write_weights(r, control * limit * limit, w)
-    w[point] = settings.pull * search.counts[SIZE]
+        w[draw_next(scratch.state, scratch.inliers, k, size)] = 1.0
+    strangers = scratch.inliers[others:]
+    foreign = 1 + random_below(scratch.state, settings.foreign) if settings.foreign > 0 else 0
+    for k in range(min(foreign, N - others)):
+        w[draw_next(scratch.state, strangers, k, N - others)] = 1.0
     weighted_model(ws.At, ws.b, w, scratch.weighted, scratch.table, x)
-    descend(ws.At, ws.b, limit, control, SHRINK, 1000, scratch, x, scratch.trial, -1)
-    if _is_new_start(search, limit, x):
-        walk_from(search, limit, settings, x, False)
+    if not straight:
+        control = settings.loose * settings.loose
+        descend(ws.At, ws.b, limit, control, SHRINK, 1000, scratch, x, search.proposals.best, -1)
+        if not _is_new_start(search, limit, x):
+            return
+    walk_from(search, limit, settings, x, False)
 
 
 @kernel
@@ -273,16 +275,20 @@ def propose_part(search: Search, limit: float, settings: Settings) -> None:
     ws, belief, scratch = search.ws, search.belief, search.scratch
     stall, local = max(search.counts[STALL], 0), settings.local
     power = settings.power / (1.0 + settings.soften * stall)
+    samples, refined = settings.samples, settings.refined
     doubtful = search.counts[AGREEMENT] <= 1000.0 * settings.agreed
-    if doubtful and stall > 0 and stall % settings.patience == settings.lost:
-        power, local = 0.0, np.inf  # what the belief favours has come to nothing: start from anywhere
-    propose(ws.At, ws.b, limit, settings.samples, power, settings.floor, belief, search.proposals, scratch)
+    if doubtful and stall > 0 and stall % settings.lost == 0:
+        # What the belief favours has come to nothing: start from anywhere. There, few samples are worth a look, and
+        # many of them a descent: those that rank best lead to the same few valleys.
+        power, local = 0.0, np.inf
+        samples, refined = settings.strays, KEPT
+    propose(ws.At, ws.b, limit, samples, power, settings.floor, belief, search.proposals, scratch)
     size = search.counts[SIZE]
     found = refine_proposals(
         ws.At,
         ws.b,
         limit,
-        settings.refined,
+        refined,
         local,
         belief,
         search.proposals,

@@ -36,16 +36,17 @@ class Settings(NamedTuple):
         How often a walk removes a random basis point; for training.
     variations
         How many variations of the incumbent are walked from where the mean belief in its points is above `agreed`.
-    least, most
-        One kind of variation is the least-squares model of a random number of the incumbent's points: between these,
-        in times of r.
-    forced, span, loose, pull
-        The other kind, `forced` of all: a robust refit in which a random point outside, within `span` limits, has
-        the weight of `pull` times all of the incumbent's points, and from there, without it, a descent that starts
-        where residuals of `loose` limits still count.
-    lost
-        In this one of every `patience` rounds without progress, where the belief does not agree with the incumbent, the
-        samples are drawn without regard to it, and refined from where half the points still count.
+    least, most, foreign, spread
+        A variation is the least-squares model of some points of the incumbent, between `least` and `most` times r of
+        them, and of at most `foreign` points outside, within `spread` limits of the incumbent.
+    loose
+        It is refined from where residuals of `loose` limits still count.
+    straight
+        So many of the variations, and all in a round without a stall, are not refined, but made from twice as many
+        points of the incumbent and from points outside that are twice as near.
+    lost, strays
+        In one of every `lost` rounds without progress, where the belief does not agree with the incumbent, `strays`
+        samples are drawn without regard to it, and `KEPT` of them refined, from where half the points still count.
     tries
         A walk's set that lacks more than one point to pass the incumbent is given up after so many points in a row
         that could not be added to it.
@@ -62,13 +63,14 @@ class Settings(NamedTuple):
     agreed: float = 0.85
     explore: float = 0.0
     variations: int = 8
-    least: int = 2
-    most: int = 8
-    forced: float = 0.5
-    span: float = 30.0
+    least: int = 1
+    most: int = 2
+    foreign: int = 4
+    spread: float = 10.0
+    straight: float = 0.5
     loose: float = 2.0
-    pull: float = 1.0
     lost: int = 2
+    strays: int = 32
     tries: int = 4
 
 
@@ -87,11 +89,12 @@ _RANGES = {
     "variations": (0, 10**6),
     "least": (1, 1000),
     "most": (1, 1000),
-    "forced": (0.0, 1.0),
-    "span": (1.0, 1e6),
+    "foreign": (0, 1000),
+    "spread": (1.0, 1e6),
+    "straight": (0.0, 1.0),
     "loose": (1.0, 1e6),
-    "pull": (0.0, 1e6),
-    "lost": (0, 100),
+    "lost": (1, 2**31 - 1),
+    "strays": (1, 2**31 - 1),
     "tries": (1, 2**31 - 1),
 }
 
