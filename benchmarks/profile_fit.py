@@ -135,14 +135,12 @@ def play_fit(problem: LinearProblem, threshold: float, rounds: int, log: Log) ->
             log(f"rounds until it agrees{level}", int(counts[SIZE]))
         coarse = arena
     if len(sizes) > 1:
-        finish_search(arena, task.limit)
-        log("first swap", int(counts[SIZE]))
         begin_search_belief(arena, task.limit)
         log("first belief", int(counts[SIZE]))
     for number in range(rounds):
-        for part, name in enumerate(PARTS):
+        for part in method.PIECES if len(sizes) > 1 else range(len(PARTS)):
             play_parts(arena, task.limit, settings, part, part + 1)
-            log(f"{number + 1}: {name}", int(counts[SIZE]))
+            log(f"{number + 1}: {PARTS[part]}", int(counts[SIZE]))
     finish_search(arena, task.limit)
     log("last swap", int(counts[SIZE]))
     return int(counts[SIZE])

@@ -25,7 +25,7 @@ def walked(A, b, threshold, reach=np.inf, explore=0.0, log_steps=40, seed=0, loy
     m = choose_start(r, reach * task.limit, search.walk.points)
     start = search.walk.points[:m].copy()
     kept = np.zeros(0, dtype=bool) if not loyal else search.member
-    args = (task.rows.At, task.rows.b, task.limit, nets.peel, m, r, 0.5, explore, kept, search.belief)
+    args = (task.rows.At, task.rows.b, task.limit, nets.peel, m, 0, np.inf, r, 0.5, explore, kept, search.belief)
     status, removed, steps = walk_down(*args, search.scratch.state, search.walk)
     assert steps <= removed <= (1 + m // ONE_OF) * steps
     return task, search, start, status, removed

@@ -21,7 +21,10 @@ from maxcon.minimax.jit import working_clock
 from maxcon.search.anytime import Step, Task
 from maxcon.search.belief_proposals import MANY
 from maxcon.search.learned_kernels import (
+    BELIEVE,
     PARTS,
+    SWAP,
+    VARY,
     WALK_INCUMBENT,
     begin_search,
     begin_search_above,
@@ -30,10 +33,12 @@ from maxcon.search.learned_kernels import (
     play_coarse_round,
     play_parts,
     read_belief,
+    swap_search,
 )
 from maxcon.search.learned_memory import (
     AGREEMENT,
     DOUBTS,
+    IN_WINDOW,
     N_COUNTS,
     ROUND,
     SIZE,
@@ -76,12 +81,15 @@ COARSE_RANKS = 20
 #: would pass the time limit is begun if it passes it by no more than half of what has been spent.
 WALK_GROWTH, OVERRUN = 1.8, 0.5
 
-#: Of many points, the first incumbent is swapped at once where there is so much of the time left that it took, and so
-#: many times as much as its walk takes.
-SWAP_FIRST, SWAP_WALKS = 0.6, 3.0
-
 #: Until a round has been timed: what it takes, in times of the root.
 ROUND_ROOTS = 1.6
+
+#: Of many points, the first incumbent is swapped at once where there is too little time for a round, but more than this
+#: of what has been spent; otherwise rounds come first, as they replace it.
+SWAP_FIRST = 0.4
+
+#: The parts of a round of many points. Variations come twice: their walks see a window only, and take little of it.
+PIECES = (*range(VARY), VARY, VARY, BELIEVE, SWAP)
 
 #: How much of a round's time must be left for the last swap to be made, and of what a piece of a round takes for
 #: another one: what is begun is finished, so that the time limit is passed by at most the rest of it.
@@ -169,7 +177,7 @@ def _search(
     counts, member, limit = arena.integers[:N_COUNTS], arena.flags[: task.problem.n_points], task.limit
     now = spoken = working_clock()
     # Of many points, a round takes so long that the clock is looked at between its parts.
-    pieces = [(k, k + 1) for k in range(PARTS)] if task.problem.n_points > MANY else [(0, PARTS)]
+    pieces = [(part, part + 1) for part in PIECES] if task.problem.n_points > MANY else [(0, PARTS)]
     took = [ROUND_ROOTS * (now - began) / len(pieces)] * len(pieces)
     reported, settled = 0, False
     if len(pieces) > 1:
@@ -178,10 +186,9 @@ def _search(
             reported, spoken = int(counts[SIZE]), working_clock()
         if walk < end - now + OVERRUN * (now - began):
             play_parts(arena, limit, settings, WALK_INCUMBENT, WALK_INCUMBENT + 1)
-            walk = working_clock() - now
         now = working_clock()
-        if end - now > max(SWAP_FIRST * (now - began), SWAP_WALKS * walk):
-            finish_search(arena, limit)
+        if SWAP_FIRST * (now - began) < end - now < ROUND_ROOTS * (now - began):
+            swap_search(arena, limit)
             now = working_clock()
         if end - now <= BELIEF_PIECES * took[0]:
             pieces = []
@@ -205,8 +212,14 @@ def _search(
                 read_belief(arena, belief_out)
             yield replace(_news(counts, member, reported), settled=True)
             reported, spoken = int(counts[SIZE]), (now := working_clock())
-    if not counts[SWAPPED] and end - now > SWAP_ROUNDS * sum(took):
+        # A swap among all of many points takes some rounds' time.
+        if counts[SWAPPED] == IN_WINDOW and counts[STALL] >= settings.patience and end - now > now - began:
+            finish_search(arena, limit)
+            now = working_clock()
+    if end == np.inf:
         finish_search(arena, limit)
+    elif not counts[SWAPPED] and end - now > SWAP_ROUNDS * sum(took):
+        swap_search(arena, limit)
     if belief_out is not None:
         read_belief(arena, belief_out)
     yield _news(counts, member, reported)

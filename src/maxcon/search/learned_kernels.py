@@ -13,11 +13,12 @@ from maxcon.agent.point_features import write_best_features
 from maxcon.minimax.jit import kernel
 from maxcon.minimax.linear import OK, cold_fit, compute_residuals
 from maxcon.search.belief import SHRINK, agreement, forget_votes, root_models, start_belief, update_belief
-from maxcon.search.belief_proposals import KEPT, propose, refine_proposals, same_model
+from maxcon.search.belief_proposals import KEPT, MANY, propose, refine_proposals, same_model
 from maxcon.search.gnc_kernels import descend
 from maxcon.search.learned_memory import (
     AGREEMENT,
     DOUBTS,
+    IN_WINDOW,
     MEMORY,
     PLACED,
     ROUND,
@@ -27,16 +28,18 @@ from maxcon.search.learned_memory import (
     SWAPPED,
     WALKED,
     WALKS,
+    WHOLLY,
     Arena,
     Search,
     carve,
 )
 from maxcon.search.learned_settings import Settings
 from maxcon.search.model_kernels import count_within, weighted_model
-from maxcon.search.peel_walk import choose_start, install_walk, walk_down
+from maxcon.search.peel_walk import choose_start, copy_rows, install_walk, walk_down
 from maxcon.search.random_kernels import draw_next, random_below, random_unit
-from maxcon.search.refine_kernels import refine_by, swap_kernel
+from maxcon.search.refine_kernels import refine_by, swap_by, swap_kernel
 from maxcon.search.vertex_kernels import load_vertex, save_vertex
+from maxcon.search.window import CORE, NEAR_MISS, OUTER, SWAP_TRIES, choose_window, window_scratch, window_workspace
 
 #: The parts of a round, in order; walks 0 and 1 start from proposals, 2 from the incumbent, the rest from variations.
 PROPOSE, WALK, WALK_INCUMBENT, VARY, BELIEVE, SWAP, PARTS = 0, 1, 3, 4, 5, 6, 7
@@ -145,21 +148,27 @@ def begin_belief(search: Search, limit: float) -> None:
 def walk_from(search: Search, limit: float, settings: Settings, x: NDArray[np.float64], loyal: bool) -> None:
     """Walk down from model x, add back, and keep what was found if it is more than the incumbent.
 
-    A `loyal` walk removes no point of the incumbent: from its model it ends at a set that holds it.
+    Of many points, the walk sees those of a window (see `window`). A `loyal` walk removes no point of the incumbent:
+    from its model it ends at a set that holds it.
     """
     ws, walk, counts, r = search.ws, search.walk, search.counts, search.trial
     N = r.shape[0]
     compute_residuals(ws.At, ws.b, x, r)
     inside = count_within(r, limit)
-    m = choose_start(r, settings.reach * limit, walk.points)
+    reach, windowed, below = settings.reach * limit, N > MANY, 0
+    m = choose_start(r, reach, walk.points)
     if m + FEW_MORE < counts[SIZE]:
         return
+    if windowed:
+        m, below = choose_window(r, CORE * limit, max(OUTER * limit, reach), walk.points)
     status, removed, steps = walk_down(
         ws.At,
         ws.b,
         limit,
         search.peel_net,
         m,
+        below,
+        reach,
         r,
         inside / N,
         settings.explore,
@@ -172,13 +181,48 @@ def walk_from(search: Search, limit: float, settings: Settings, x: NDArray[np.fl
     counts[STEPS] = steps
     if status != OK:
         return
-    install_walk(ws, m, walk)
-    size = count_within(ws.r, limit)
-    if 10 * size < 9 * counts[SIZE] - 10:  # too far off for a few more points to matter
+    if windowed and not _refine_window(search, limit, m, m - removed, below, settings.tries):
         return
-    for i in range(N):
-        search.refinement.tried[i] = False
-    size = m - removed + refine_by(ws, limit, search.refinement, counts[SIZE] - (m - removed) + 1, settings.tries)
+    _take_walk(search, limit, m, settings.tries)
+
+
+@kernel
+def _refine_window(search: Search, limit: float, m: int, size: int, below: int, tries: int) -> bool:
+    """Add points to the end of a walk, of those in its window; whether they may be more than the incumbent's.
+
+    The walk's set has `size` points in the window and `below` that are not.
+    """
+    to_beat = search.counts[SIZE] - below
+    ws = window_workspace(search.ws.At.shape[0], m, search.walk)
+    compute_residuals(ws.At, ws.b, ws.x, ws.r)
+    if 10 * (count_within(ws.r, limit) + below) < 9 * search.counts[SIZE] - 10:  # too far off, as in `_take_walk`
+        return False
+    scratch = window_scratch(m, search.refinement)
+    for i in range(m):
+        scratch.tried[i] = False
+    miss = NEAR_MISS if search.counts[ROUND] > 0 else -1  # the first set is soon replaced
+    size += refine_by(ws, limit, scratch, to_beat - miss - size, tries)
+    if to_beat - miss <= size <= to_beat:
+        size += swap_by(ws, limit, scratch, SWAP_TRIES)
+    return bool(size > to_beat)
+
+
+@kernel
+def _take_walk(search: Search, limit: float, m: int, tries: int) -> None:
+    """Add points to the end of a walk that saw m points, and keep that if it is more than the incumbent.
+
+    After a window only what its vertex explains: of the others, those in the window have been tried.
+    """
+    ws, walk, counts = search.ws, search.walk, search.counts
+    windowed = ws.gain.shape[0] > MANY
+    install_walk(ws, m, walk)
+    if 10 * count_within(ws.r, limit) < 9 * counts[SIZE] - 10:  # too far off for a few more points to matter
+        return
+    size = 0
+    for i in range(ws.gain.shape[0]):
+        search.refinement.tried[i] = windowed and abs(ws.r[i]) > limit
+        size += ws.gain[i] == 1.0
+    size += refine_by(ws, limit, search.refinement, counts[SIZE] - size + 1, tries)
     if size > counts[SIZE]:
         take_vertex(search, limit, size)
 
@@ -198,8 +242,8 @@ def _is_new_start(search: Search, limit: float, x: NDArray[np.float64]) -> bool:
 def walk_part(search: Search, limit: float, settings: Settings, which: int) -> None:
     """Walk from proposal 0 or 1, or (2) from the incumbent, unless that has been done or cannot find more.
 
-    A loyal walk ends at a set that holds the incumbent. One that has its vertex has been refined: no point can be added
-    to it, so that no larger feasible set holds it.
+    A loyal walk ends at a set that holds the incumbent. One that has its vertex has been refined: no point (of its
+    window) can be added to it, so that no larger feasible set holds it.
     """
     if which < 2:
         proposals, best = search.proposals, -1
@@ -314,16 +358,37 @@ def place_incumbent(search: Search, limit: float) -> bool:
 
 
 @kernel
-def swap_part(search: Search, limit: float) -> None:
-    """Refine and swap the incumbent, unless that has been done."""
+def swap_window(search: Search, limit: float) -> None:
+    """Swap among the points of the incumbent's window; a set found so is refined among all points."""
+    ws, walk, member, r = search.ws, search.walk, search.member, search.trial
+    compute_residuals(ws.At, ws.b, search.x, r)
+    m, _ = choose_window(r, CORE * limit, OUTER * limit, walk.points)
+    window = copy_rows(ws.At, ws.b, m, walk)
+    for k in range(m):
+        if not member[walk.points[k]]:
+            window.gain[k] = 0.0
+            window.cap[k] = np.inf
+    if m == 0 or cold_fit(*window) != OK or window.x[window.x.shape[0] - 1] > limit:
+        return
+    if swap_by(window, limit, window_scratch(m, search.refinement), SWAP_TRIES) > 0:
+        _take_walk(search, limit, m, member.shape[0])
+
+
+@kernel
+def swap_part(search: Search, limit: float, wholly: bool) -> None:
+    """Refine and swap the incumbent, unless that has been done; of many points in its window, or `wholly` among all."""
     counts = search.counts
-    if counts[SWAPPED] or counts[SIZE] == 0:
+    if counts[SIZE] == 0 or counts[SWAPPED] >= (WHOLLY if wholly else IN_WINDOW):
+        return
+    if not wholly and search.member.shape[0] > MANY:
+        swap_window(search, limit)
+        counts[SWAPPED] = IN_WINDOW
         return
     if place_incumbent(search, limit):
         gained = swap_kernel(search.ws, limit, search.refinement)
         if gained > 0:
             take_vertex(search, limit, counts[SIZE] + gained)
-    counts[SWAPPED] = 1
+    counts[SWAPPED] = WHOLLY
 
 
 @kernel
@@ -344,7 +409,7 @@ def play(search: Search, limit: float, settings: Settings, first: int, last: int
             counts[AGREEMENT] = int(1000.0 * agreed)
             counts[DOUBTS] = doubts
         elif counts[STALL] > 0 and counts[AGREEMENT] > 1000.0 * settings.agreed:
-            swap_part(search, limit)
+            swap_part(search, limit, False)
     if last == PARTS:
         _end_round(search, settings)
 
@@ -391,9 +456,15 @@ def play_coarse_round(arena: Arena, limit: float, settings: Settings) -> None:
 
 
 @kernel
+def swap_search(arena: Arena, limit: float) -> None:
+    """Swap the incumbent; of many points, those in its window only."""
+    swap_part(carve(arena), limit, False)
+
+
+@kernel
 def finish_search(arena: Arena, limit: float) -> None:
-    """Refine and swap the incumbent for the last time."""
-    swap_part(carve(arena), limit)
+    """Refine and swap the incumbent among all points, for the last time."""
+    swap_part(carve(arena), limit, True)
 
 
 @kernel

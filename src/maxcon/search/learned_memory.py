@@ -28,7 +28,7 @@ from maxcon.search.vertex_kernels import VertexCopies
 #: How many starts of walks are remembered, so that none is made twice.
 MEMORY = 16
 
-#: Places in `Search.counts`: the size of the incumbent, the number of the round, rounds without progress, whether the
+#: Places in `Search.counts`: the size of the incumbent, the number of the round, rounds without progress, how the
 #: incumbent has been swapped, whether its vertex is kept, walks made, steps of the last walk, whether the
 #: incumbent has been walked from, how much of each block `carve` uses, the mean belief in the incumbent's points in
 #: thousandths, and the number of points outside the incumbent that are believed in.
@@ -36,6 +36,10 @@ SIZE, ROUND, STALL, SWAPPED, PLACED, WALKS, STEPS, WALKED = 0, 1, 2, 3, 4, 5, 6,
 FLOATS_USED, INTEGERS_USED, FLAGS_USED = 8, 9, 10
 AGREEMENT, DOUBTS = 11, 12
 N_COUNTS = 16
+
+#: How the incumbent has been swapped, in ``counts[SWAPPED]``, where it has: among the points of its window (see
+#: `window`), or among all.
+IN_WINDOW, WHOLLY = 1, 2
 
 
 class Arena(NamedTuple):

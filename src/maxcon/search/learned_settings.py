@@ -35,7 +35,8 @@ class Settings(NamedTuple):
     explore
         How often a walk removes a random basis point; for training.
     variations
-        How many variations of the incumbent are walked from where the mean belief in its points is above `agreed`.
+        How many variations of the incumbent are walked from where the mean belief in its points is above `agreed`; of
+        more than 400 points twice, as walks are a smaller part of a round there.
     least, most, foreign, spread
         A variation is the least-squares model of some points of the incumbent, between `least` and `most` times r of
         them, and of at most `foreign` points outside, within `spread` limits of the incumbent.

@@ -75,7 +75,7 @@ def choose_start(r: NDArray[np.float64], reach: float, points: NDArray[np.int64]
 
 
 @kernel
-def _copy_rows(At: NDArray[np.float64], b: NDArray[np.float64], m: int, walk: Walk) -> Workspace:
+def copy_rows(At: NDArray[np.float64], b: NDArray[np.float64], m: int, walk: Walk) -> Workspace:
     """Return a workspace of the rows of ``walk.points[:m]``, all of them in the fit."""
     d = At.shape[0]
     rows = walk.At[: d * m].reshape(d, m)
@@ -109,6 +109,8 @@ def walk_down(
     limit: float,
     net: Perceptron,
     m: int,
+    below: int,
+    reach: float,
     proposal: NDArray[np.float64],
     proposal_share: float,
     explore: float,
@@ -117,7 +119,7 @@ def walk_down(
     state: NDArray[np.int64],
     walk: Walk,
 ) -> tuple[int, int, int]:
-    """Remove basis points from the set ``walk.points[:m]`` until it is feasible.
+    """Remove basis points from the set of those of ``walk.points[:m]`` that the proposal reaches until it is feasible.
 
     Of many points several are removed in a step, as the network ranks them: what that costs comes back when points are
     added to the end of the walk.
@@ -126,6 +128,10 @@ def walk_down(
     ----------
     limit
         Threshold plus slack, in the unit of the rows.
+    m, below
+        How many points the walk sees, and how many more its set has.
+    reach
+        Points with a larger residual of the proposal are not in the set.
     proposal, proposal_share
         Shape (N,): the residuals of the model that the set comes from, and the share of its inliers.
     explore
@@ -138,17 +144,23 @@ def walk_down(
 
     Returns
     -------
-    OK, or FAILED where a fit did; how many points were removed, in how many steps. The vertex reached is in ``walk.C``,
-    ``walk.x``, ``walk.q`` (named by places in ``walk.points``) with ``walk.gain[:m]`` 1 for the points kept.
+    OK, or FAILED where a fit did; how many points were left out or removed, and the number of steps. The vertex
+    reached is in ``walk.C``, ``walk.x``, ``walk.q`` (named by places in ``walk.points``) with ``walk.gain[:m]`` 1 for
+    the points kept.
     """
-    wAt, wb, gain, cap, C, x, q, r, work, table = _copy_rows(At, b, m, walk)
+    wAt, wb, gain, cap, C, x, q, r, work, table = copy_rows(At, b, m, walk)
     points, basis, named, multipliers, sides = walk.points, walk.basis, walk.named, walk.multipliers, walk.sides
     features, hidden, logit, known = walk.features, walk.hidden, belief.logit, belief.features
     n = x.shape[0]
-    several = 1 + m // ONE_OF
-    if m == 0 or cold_fit(wAt, wb, gain, cap, C, x, q, r, work, table) != OK:
-        return FAILED, 0, 0
     removed = steps = 0
+    for k in range(m):
+        if abs(proposal[points[k]]) > reach:
+            gain[k] = 0.0
+            cap[k] = np.inf
+            removed += 1
+    several = 1 + (m - removed) // ONE_OF
+    if m == removed or cold_fit(wAt, wb, gain, cap, C, x, q, r, work, table) != OK:
+        return FAILED, 0, 0
     while x[n - 1] > limit:
         size = basis_points(C, q, basis)
         if size == 0:
@@ -157,7 +169,7 @@ def walk_down(
         for slot in range(size):
             sides[slot] = 1.0 if r[basis[slot]] >= 0.0 else -1.0
             named[slot] = points[basis[slot]]
-        share = (m - removed) / At.shape[1]
+        share = (below + m - removed) / At.shape[1]
         write_peel_features(
             named,
             size,

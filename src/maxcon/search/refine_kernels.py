@@ -380,6 +380,12 @@ def swap_kernel(ws: Workspace, limit: float, scratch: RefineScratch) -> int:
     with p, the rest of S and a new point j holds an infeasible S + j. The final set is therefore still
     maximal.
     """
+    return swap_by(ws, limit, scratch, ws.r.shape[0])
+
+
+@kernel
+def swap_by(ws: Workspace, limit: float, scratch: RefineScratch, tries: int) -> int:
+    """Do what `swap_kernel` does, but give up on a dropped point after `tries` others in a row that do not fit."""
     N = ws.r.shape[0]
     for i in range(N):
         scratch.tried[i] = False
@@ -398,7 +404,7 @@ def swap_kernel(ws: Workspace, limit: float, scratch: RefineScratch) -> int:
         _choose_substitutes(ws, scratch, point)
         more = 0
         if remove_point(ws, point) == OK and ws.x[ws.x.shape[0] - 1] <= limit:
-            more = refine_by(ws, limit, scratch, 2, N) - 1
+            more = refine_by(ws, limit, scratch, 2, tries) - 1
         changed = more > 0
         if changed:
             gained += more
