@@ -189,7 +189,7 @@ def _eliminate(At: NDArray[np.float64], b: Any, point: int, rank: int, *rest: An
 
 def _lanes(At: NDArray[np.float64], b: Any, count: int, lanes: Any) -> float:
     d = At.shape[0]
-    return count * (d**3 / 3.0 + d * d)
+    return float(count * (d**3 / 3.0 + d * d))
 
 
 #: Module, function, multiply-adds of a call, and whether it calls no other kernel: then it may be compiled on its own.

@@ -335,3 +335,24 @@ def test_no_line_from_dependent_points() -> None:
     assert find_line(At, np.zeros(3), np.array([0, 1]), 2, line, places) == -1
     assert find_line(At, np.zeros(3), np.array([0, 1, 2]), 3, line, places) == 3
     assert places[:2].tolist() == [0, 2]
+
+
+@compiled_only
+def test_little_work_is_begun_where_little_time_is_left(monkeypatch):
+    """So that a time limit is not passed by the whole of what an undisturbed search does between two looks."""
+    advance, asked = partition.advance, []
+
+    def noted(state, budget):
+        asked.append(budget)
+        return advance(state, budget)
+
+    monkeypatch.setattr(partition, "advance", noted)
+    A, b = synthetic(np.random.default_rng(0), 100, 8, 0.4)
+    for left, most in ((0.0, partition.LEAST_BUDGET), (np.inf, np.inf)):
+        monkeypatch.setattr(Task, "seconds_left", lambda self, left=left: left)
+        asked.clear()
+        for _ in zip(range(50), exact_partition(task_for(A, b, 0.1), n_jobs=1), strict=False):
+            pass
+        assert len(asked) > 20
+        assert max(asked) <= most
+    assert max(asked) > 10 * partition.LEAST_BUDGET

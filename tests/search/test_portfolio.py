@@ -8,7 +8,7 @@ from numba import config
 
 from instances import synthetic
 from maxcon.problem import LinearProblem
-from maxcon.search import partition, portfolio
+from maxcon.search import portfolio
 from maxcon.search.anytime import Step, make_task, run
 from maxcon.search.learned import learned
 from oracles import milp_consensus
@@ -93,21 +93,3 @@ def test_where_a_proof_is_out_of_reach_the_search_goes_on(monkeypatch, out_of_re
     if out_of_reach:
         assert limits[1] == pytest.approx((1 - portfolio.BOUND_SHARE) * LONG, rel=0.05)
     assert [size for _, size in last] == [best.size]
-
-
-@compiled_only
-def test_little_work_is_begun_where_little_time_is_left(monkeypatch):
-    """So that a time limit is not passed by the whole of what an undisturbed search does between two looks."""
-    advance, asked = partition.advance, []
-
-    def noted(state, budget):
-        asked.append(budget)
-        return advance(state, budget)
-
-    monkeypatch.setattr(partition, "advance", noted)
-    A, b = synthetic(np.random.default_rng(0), 100, 8, 0.5)
-    task = make_task(LinearProblem(A, b), 0.1, np.random.default_rng(0), 0.2)
-    start = run(task, learned(task, rounds=2)).subset
-    run(task, partition.exact_partition(task, start=start, n_jobs=1))
-    assert task.over()
-    assert asked[-1] < partition.LEAST_BUDGET + 0.5 * max(asked)

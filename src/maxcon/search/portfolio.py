@@ -2,9 +2,9 @@
 
 | parameters | time limit | what is done |
 | --- | --- | --- |
-| up to 3 | none, or enough for a proof (`PROOF_SECONDS`) | the exact search |
+| up to 3 | none, or enough for a proof (`PROOF_SECONDS`, `HARD_SHARE`) | the exact search |
 | up to 3 | less | the learned search for `SHORT_SHARE` of the time; then the exact search, or `RATE_SECONDS`: it anew |
-| up to 3 | less than twice an easy proof (`EASY_SECONDS`, `EASY_SHARE`) | the learned search |
+| up to 3 | less than twice an easy proof (`EASY_SHARE`), or up to 2 parameters | the learned search |
 | more | none | `propose`, the learned search until it has settled, then `BRIEF_WORK` of the exact search |
 | more | up to `ALL_LEARNED` seconds a point and `MOST_LEARNED`, no gap asked | the learned search, in between a proof |
 | more | more | `propose`, the learned search until it has settled, at most `LONG_SHARE` of the time; the exact search |
@@ -30,7 +30,8 @@ from maxcon.search.proof import MOST_PARAMETERS, prove
 from maxcon.search.proposal import propose
 from maxcon.search.refine import swap_refinement
 
-#: Seconds a point that the exact search takes at 90% outliers and N = 1000, by the number of parameters.
+#: Seconds a point that the exact search takes at 90% outliers and N = 1000, by the number of parameters. With three
+#: parameters and fewer points it takes longer a point: see `RATE_SECONDS`.
 PROOF_SECONDS = {0: 9e-7, 1: 9e-7, 2: 9e-7, 3: 4e-5}
 
 #: Where the time is too short for any proof, this part of it goes to the learned search first.
@@ -40,9 +41,9 @@ SHORT_SHARE = 0.5
 #: seconds (N = 100 to 1000, s = .1 to .5): where that is more than is left, the learned search begins anew instead.
 RATE_SECONDS = 2e-6
 
-#: Seconds a point that the exact search takes at 20% outliers with up to two parameters, and the share of inliers by
-#: which a proof with three is reckoned: in less, no time is kept for it.
-EASY_SECONDS, EASY_SHARE = 1e-6, 0.5
+#: The shares of inliers by which a proof with three parameters is reckoned: where there is time even for the hard one
+#: it comes first, and where there is too little even for the easy one none is kept for it.
+HARD_SHARE, EASY_SHARE = 0.1, 0.5
 
 #: With more than three parameters no proof is attempted in so little time, in seconds a point: what it would find or
 #: prove is less than what the learned search still gains.
@@ -92,7 +93,7 @@ def auto(task: Task, *, n_jobs: int = -1) -> Iterator[Step]:
     check_jobs(n_jobs)
     left = task.seconds_left()
     if task.problem.n_params <= MOST_PARAMETERS:
-        if left >= PROOF_SECONDS[task.problem.n_params] * task.problem.n_points:
+        if left >= _most_proof_seconds(task.problem.n_points, task.problem.n_params):
             return prove(task, n_jobs=n_jobs)
         return _short(task, left)
     if task.gap == 0 and left <= min(ALL_LEARNED * task.problem.n_points, MOST_LEARNED):
@@ -102,14 +103,14 @@ def auto(task: Task, *, n_jobs: int = -1) -> Iterator[Step]:
 
 def _short(task: Task, left: float) -> Iterator[Step]:
     N, d = task.problem.n_points, task.problem.n_params
-    if (1.0 - SHORT_SHARE) * left < (EASY_SECONDS * N if d < MOST_PARAMETERS else _proof_seconds(N, EASY_SHARE)):
+    if d < MOST_PARAMETERS or (1.0 - SHORT_SHARE) * left < _proof_seconds(N, EASY_SHARE):
         yield from learned(task)
         return
     found = 0
     for step in learned(replace(task, deadline=task.deadline - (1.0 - SHORT_SHARE) * left)):
         found = found if step.subset is None else int(np.count_nonzero(step.subset))
         yield step
-    if d < MOST_PARAMETERS or _proof_seconds(N, max(found, 1) / N) <= task.seconds_left():
+    if _proof_seconds(N, max(found, 1) / N) <= task.seconds_left():
         yield from prove(task)
     else:
         yield from learned(task)
@@ -135,6 +136,12 @@ def reckoned_proof(inliers: NDArray[np.bool_]) -> float:
     """Return about how many seconds it takes to prove, beyond three parameters, that a set is the largest."""
     N = len(inliers)
     return float(PROOF_RATE * N**2 * PROOF_GROWTH ** (10.0 * (1.0 - np.count_nonzero(inliers) / N)))
+
+
+def _most_proof_seconds(n_points: int, n_params: int) -> float:
+    """Return about how long the exact search takes at most, up to three parameters."""
+    most = PROOF_SECONDS[n_params] * n_points
+    return max(most, _proof_seconds(n_points, HARD_SHARE)) if n_params == MOST_PARAMETERS else most
 
 
 def _proof_seconds(n_points: int, inlier_share: float) -> float:
