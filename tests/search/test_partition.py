@@ -353,6 +353,6 @@ def test_little_work_is_begun_where_little_time_is_left(monkeypatch):
         asked.clear()
         for _ in zip(range(50), exact_partition(task_for(A, b, 0.1), n_jobs=1), strict=False):
             pass
-        assert len(asked) > 20
+        assert len(asked) > 5
         assert max(asked) <= most
     assert max(asked) > 10 * partition.LEAST_BUDGET
