@@ -92,4 +92,4 @@ def test_where_a_proof_is_out_of_reach_the_search_goes_on(monkeypatch, out_of_re
     assert limits[0] == np.inf
     if out_of_reach:
         assert limits[1] == pytest.approx((1 - portfolio.BOUND_SHARE) * LONG, rel=0.05)
-    assert [size for _, size in last] == [best.size]
+    assert last[-1][1] == best.size

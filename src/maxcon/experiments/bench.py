@@ -279,20 +279,23 @@ def _run(work: _Work) -> Unit:
 
 
 def _rows(work: _Work, instance: Instance, served: Sequence[str]) -> list[Row]:
-    """Return what everyone finds on an instance, budget by budget, each time in an order of its own.
+    """Return what everyone finds on an instance, budget by budget, each time run in an order of its own.
 
     The first on an instance finds cold caches, as does whoever comes after one that fills them with other things.
     """
     settings, rows = work.settings, []
     order = np.random.default_rng([settings.seed, work.number])
     peers = {peer.name: peer for peer in peers_for(work.cell.family, settings.methods)}
+    names = [*served, *peers]
     for budget in settings.budgets:
-        for name in order.permutation([*served, *peers]):
+        found: dict[str, Row] = {}
+        for name in map(str, order.permutation(names)):
             if name in peers:
                 choice = Choice(**work.choices[name][f"{budget:g}"])
-                rows.append(peer_row(instance, peers[name], choice, budget, settings.seeds))
+                found[name] = peer_row(instance, peers[name], choice, budget, settings.seeds)
             else:
-                rows.append(our_row(instance, str(name), budget, settings.seeds))
+                found[name] = our_row(instance, name, budget, settings.seeds)
+        rows += [found[name] for name in names]
     return rows
 
 

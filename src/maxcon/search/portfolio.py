@@ -10,8 +10,8 @@
 | more | more | `propose`, the learned search until it has settled, at most `LONG_SHARE` of the time; the exact search |
 
 A proof in between: where the learned search has settled, the exact search gets the time that it seems to need
-(`reckoned_proof`), if that is there, and the learned search the rest. Where there is more time, and a proof seems out
-of reach all the same, the learned search goes on, and the exact search gets `BOUND_SHARE` for a bound.
+(`reckoned_proof`), if that is there, and the learned search the rest. Where there is more time, and a proof is out of
+reach all the same (`HOPELESS`), the learned search goes on, and the exact search gets `BOUND_SHARE` for a bound.
 """
 
 from __future__ import annotations
@@ -58,8 +58,9 @@ PROOF_RATE, PROOF_GROWTH = 5e-9, 10.0
 #: and up to so many times as long as was reckoned: beyond, it seldom ends.
 PROOF_SHARE, PROOF_TIMES = 0.6, 5.0
 
-#: In more time, where a proof seems out of reach, the last part of it goes to a bound.
-BOUND_SHARE = 0.25
+#: In more time, where a proof is reckoned to take so many times what is left, it is out of reach. The last part of the
+#: time then goes to a bound, and `BRIEF_SECONDS` already before the search goes on, if they are at most such a share.
+HOPELESS, BOUND_SHARE, BRIEF_SHARE = 20.0, 0.25, 0.4
 
 #: However many points there are, a proof is attempted in more time than this, in seconds, or where a gap is asked for.
 MOST_LEARNED = 1.0
@@ -72,7 +73,7 @@ LONG_SHARE = 0.5
 
 #: Where no time is given, the exact search beyond three parameters ends after so much work, in columns of linear
 #: programmes: some 60 ms, which prove 30 outliers of 100 with eight parameters, and most pairs of a KITTI drive.
-BRIEF_WORK = 2_000_000
+BRIEF_WORK, BRIEF_SECONDS = 2_000_000, 0.065
 
 
 def auto(task: Task, *, n_jobs: int = -1) -> Iterator[Step]:
@@ -155,21 +156,33 @@ def _long(task: Task, left: float, n_jobs: int) -> Iterator[Step]:
     untimed = replace(task, deadline=np.inf)  # so that the learned search ends by itself
     first = propose(task) if task.problem.n_points <= PROPOSED_POINTS else iter(())
     for step in chain(first, learned(untimed, belief_out=belief)):
-        if step.subset is not None and np.count_nonzero(step.subset) > np.count_nonzero(best):
-            best = step.subset
+        best = _larger(best, step)
         yield step
         if own.over():
             yield Step(subset=(best := _refined(task, best)), refined=True)
             break
-    if np.isfinite(left):
-        if reckoned_proof(best) > task.seconds_left() > BOUND_SHARE * left:
-            for step in learned(replace(task, deadline=task.deadline - BOUND_SHARE * left), belief_out=belief):
-                if step.subset is not None and np.count_nonzero(step.subset) > np.count_nonzero(best):
-                    best = step.subset
-                yield step
-        yield from exact_partition(task, start=best, belief=belief, n_jobs=n_jobs)
-    else:
+    if not np.isfinite(left):
         yield from exact_partition(task, start=best, belief=belief, n_jobs=1, max_work=BRIEF_WORK)
+        return
+    proof, started = exact_partition(task, start=best, belief=belief, n_jobs=n_jobs), best
+    if reckoned_proof(best) > HOPELESS * task.seconds_left():
+        if BRIEF_SHARE * task.seconds_left() >= BRIEF_SECONDS:
+            until = task.seconds_left() - BRIEF_SECONDS
+            for step in proof:  # gone on with below
+                best = _larger(best, step)
+                yield step
+                if task.seconds_left() <= until:
+                    break
+        for step in learned(replace(task, deadline=task.deadline - BOUND_SHARE * left), belief_out=belief):
+            best = _larger(best, step)
+            yield step
+    yield from proof if best is started else exact_partition(task, start=best, belief=belief, n_jobs=n_jobs)
+
+
+def _larger(best: NDArray[np.bool_], step: Step) -> NDArray[np.bool_]:
+    """Return the set of a step if it is larger than the best, else that."""
+    more = step.subset is not None and np.count_nonzero(step.subset) > np.count_nonzero(best)
+    return step.subset if step.subset is not None and more else best
 
 
 def _refined(task: Task, best: NDArray[np.bool_]) -> NDArray[np.bool_]:
