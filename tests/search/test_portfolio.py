@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import numpy as np
 import pytest
 from numba import config
 
 from instances import synthetic
+from maxcon.agent.search_networks import shipped_search_networks
 from maxcon.problem import LinearProblem
 from maxcon.search import portfolio
 from maxcon.search.anytime import Step, make_task, run
@@ -19,6 +22,9 @@ compiled_only = pytest.mark.skipif(config.DISABLE_JIT, reason="takes minutes whe
 LONG = 60.0
 
 
+briefly = partial(learned, rounds=8)
+
+
 def task_for(rate, time_limit, n_points=30, d=5, seed=0):
     A, b = synthetic(np.random.default_rng(seed), n_points, d, rate)
     return make_task(LinearProblem(A, b), 0.1, np.random.default_rng(0), time_limit)
@@ -28,7 +34,7 @@ def task_for(rate, time_limit, n_points=30, d=5, seed=0):
 @pytest.mark.parametrize("seed", range(4))
 def test_easy_data_are_proven_in_between(seed):
     task = task_for(0.15, LONG, seed=seed)
-    best = run(task, portfolio._learned_and_proof(task))
+    best = run(task, portfolio._learned_and_proof(task, learned))
     assert best.gap == 0
     assert best.size == milp_consensus(task.problem.A, task.problem.b, 0.1)
     assert task.seconds_left() > 0.5 * LONG
@@ -38,8 +44,7 @@ def test_what_cannot_be_proven_in_time_is_not_begun(monkeypatch):
     task = task_for(0.15, LONG)
     monkeypatch.setattr(portfolio, "PROOF_RATE", 1e9)
     monkeypatch.setattr(portfolio, "exact_partition", lambda *_, **__: pytest.fail("a proof was begun"))
-    monkeypatch.setattr(portfolio, "learned", lambda task, **options: learned(task, rounds=8, **options))
-    steps = list(portfolio._learned_and_proof(task))
+    steps = list(portfolio._learned_and_proof(task, briefly))
     assert any(step.settled for step in steps)
 
 
@@ -52,15 +57,14 @@ def test_a_proof_in_between_has_its_time_and_the_search_the_rest(monkeypatch):
         yield Step(upper_bound=29)
 
     monkeypatch.setattr(portfolio, "exact_partition", fruitless)
-    monkeypatch.setattr(portfolio, "learned", lambda task, **options: learned(task, rounds=8, **options))
-    steps = list(portfolio._learned_and_proof(task := task_for(0.15, LONG)))
+    steps = list(portfolio._learned_and_proof(task := task_for(0.15, LONG), briefly))
     place = next(k for k, step in enumerate(steps) if step.upper_bound == 29)
     assert steps[place - 1].settled
     assert place + 1 < len(steps)
     sets = [step.subset for step in steps[:place] if step.subset is not None]
     assert given[0] <= portfolio.PROOF_TIMES * portfolio.reckoned_proof(sets[-1]) < task.seconds_left()
     monkeypatch.setattr(portfolio, "PROOF_TIMES", 1e9)
-    list(portfolio._learned_and_proof(task_for(0.15, LONG)))
+    list(portfolio._learned_and_proof(task_for(0.15, LONG), briefly))
     assert given[1] == pytest.approx(portfolio.PROOF_SHARE * LONG, rel=0.05)
 
 
@@ -93,3 +97,20 @@ def test_where_a_proof_is_out_of_reach_the_search_goes_on(monkeypatch, out_of_re
     if out_of_reach:
         assert limits[1] == pytest.approx((1 - portfolio.BOUND_SHARE) * LONG, rel=0.05)
     assert last[-1][1] == best.size
+
+
+@compiled_only
+def test_ones_own_networks_are_searched_with(tmp_path, monkeypatch):
+    nets, used = shipped_search_networks(), []
+
+    def noted(task, *, network, **options):
+        used.append(network)
+        return learned(task, network=network, **options)
+
+    monkeypatch.setattr(portfolio, "learned", noted)
+    for time_limit in (1e-4, LONG):
+        list(portfolio.auto(task_for(0.1, time_limit), network=nets))
+    assert len(used) >= 2
+    assert all(each is nets for each in used)
+    with pytest.raises(ValueError, match="there is no file"):
+        portfolio.auto(task_for(0.1, None), network=tmp_path / "none.safetensors")

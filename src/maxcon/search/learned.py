@@ -147,14 +147,7 @@ def learned(
     TypeError, ValueError
         If an option has the wrong type, or is outside its range, or the file does not hold such networks.
     """
-    if network is None:
-        nets = shipped_search_networks()
-    elif isinstance(network, SearchNetworks):
-        nets = network
-    elif isinstance(network, (str, Path)):
-        nets = load_search_networks(Path(network))
-    else:
-        raise TypeError(f"network must be a file name or a pair of networks, but it is a {type(network).__name__}")
+    nets = search_networks(network)
     if rounds is not None:
         rounds = check_count(rounds, "rounds", 1)
     N = task.problem.n_points
@@ -166,6 +159,23 @@ def learned(
     ):
         raise ValueError(f"belief_out must be an array of shape ({N},) and type float64 that can be written to")
     return _search(task, nets, rounds, Settings() if settings is None else check_settings(settings), belief_out)
+
+
+def search_networks(network: str | Path | SearchNetworks | None) -> SearchNetworks:
+    """Return the pair of networks that an option names: a file, a pair, or the shipped one.
+
+    Raises
+    ------
+    TypeError, ValueError
+        If it is neither, or the file does not hold such networks.
+    """
+    if network is None:
+        return shipped_search_networks()
+    if isinstance(network, SearchNetworks):
+        return network
+    if isinstance(network, (str, Path)):
+        return load_search_networks(Path(network))
+    raise TypeError(f"network must be a file name or a pair of networks, but it is a {type(network).__name__}")
 
 
 def _search(

@@ -18,13 +18,16 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import replace
+from functools import partial
 from itertools import chain
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from maxcon.search.anytime import Step, Task
-from maxcon.search.learned import learned
+from maxcon.agent.search_networks import SearchNetworks
+from maxcon.search.anytime import Method, Step, Task
+from maxcon.search.learned import learned, search_networks
 from maxcon.search.partition import check_jobs, exact_partition
 from maxcon.search.proof import MOST_PARAMETERS, prove
 from maxcon.search.proposal import propose
@@ -76,7 +79,7 @@ LONG_SHARE = 0.5
 BRIEF_WORK, BRIEF_SECONDS = 2_000_000, 0.065
 
 
-def auto(task: Task, *, n_jobs: int = -1) -> Iterator[Step]:
+def auto(task: Task, *, n_jobs: int = -1, network: str | Path | SearchNetworks | None = None) -> Iterator[Step]:
     """Yield ever better sets and bounds, by the methods that the problem and the time call for.
 
     Parameters
@@ -85,43 +88,46 @@ def auto(task: Task, *, n_jobs: int = -1) -> Iterator[Step]:
         What is fitted. Without a time limit the same data get the same answer; ``method="exact"`` goes on to a proof.
     n_jobs
         How many threads the exact search may use where there is a time limit; -1 for one a core.
+    network
+        The networks of the learned search: a file, or a pair; None for the shipped pair.
 
     Raises
     ------
     TypeError, ValueError
-        If `n_jobs` is not -1 or a whole number of at least 1.
+        If `n_jobs` is not -1 or a whole number of at least 1, or `network` holds no such networks.
     """
     check_jobs(n_jobs)
+    search = partial(learned, network=None if network is None else search_networks(network))
     left = task.seconds_left()
     if task.problem.n_params <= MOST_PARAMETERS:
         if left >= _most_proof_seconds(task.problem.n_points, task.problem.n_params):
             return prove(task, n_jobs=n_jobs)
-        return _short(task, left)
+        return _short(task, left, search)
     if task.gap == 0 and left <= min(ALL_LEARNED * task.problem.n_points, MOST_LEARNED):
-        return _learned_and_proof(task)
-    return _long(task, left, n_jobs)
+        return _learned_and_proof(task, search)
+    return _long(task, left, n_jobs, search)
 
 
-def _short(task: Task, left: float) -> Iterator[Step]:
+def _short(task: Task, left: float, search: Method) -> Iterator[Step]:
     N, d = task.problem.n_points, task.problem.n_params
     if d < MOST_PARAMETERS or (1.0 - SHORT_SHARE) * left < _proof_seconds(N, EASY_SHARE):
-        yield from learned(task)
+        yield from search(task)
         return
     found = 0
-    for step in learned(replace(task, deadline=task.deadline - (1.0 - SHORT_SHARE) * left)):
+    for step in search(replace(task, deadline=task.deadline - (1.0 - SHORT_SHARE) * left)):
         found = found if step.subset is None else int(np.count_nonzero(step.subset))
         yield step
     if _proof_seconds(N, max(found, 1) / N) <= task.seconds_left():
         yield from prove(task)
     else:
-        yield from learned(task)
+        yield from search(task)
 
 
-def _learned_and_proof(task: Task) -> Iterator[Step]:
+def _learned_and_proof(task: Task, search: Method) -> Iterator[Step]:
     """Search by learning; where few points are left out, stop once for a proof, which then takes no longer."""
     N = task.problem.n_points
     best, belief = np.zeros(N, dtype=np.bool_), np.full(N, 0.5)
-    for step in learned(task, belief_out=belief):
+    for step in search(task, belief_out=belief):
         best = best if step.subset is None else step.subset
         yield step
         if step.settled:
@@ -150,12 +156,12 @@ def _proof_seconds(n_points: int, inlier_share: float) -> float:
     return float(RATE_SECONDS * n_points**0.75 / inlier_share**2)
 
 
-def _long(task: Task, left: float, n_jobs: int) -> Iterator[Step]:
+def _long(task: Task, left: float, n_jobs: int, search: Method) -> Iterator[Step]:
     own = replace(task, deadline=task.deadline - (1.0 - LONG_SHARE) * left) if np.isfinite(left) else task
     best, belief = np.zeros(task.problem.n_points, dtype=np.bool_), np.full(task.problem.n_points, 0.5)
     untimed = replace(task, deadline=np.inf)  # so that the learned search ends by itself
     first = propose(task) if task.problem.n_points <= PROPOSED_POINTS else iter(())
-    for step in chain(first, learned(untimed, belief_out=belief)):
+    for step in chain(first, search(untimed, belief_out=belief)):
         best = _larger(best, step)
         yield step
         if own.over():
@@ -173,7 +179,7 @@ def _long(task: Task, left: float, n_jobs: int) -> Iterator[Step]:
                 yield step
                 if task.seconds_left() <= until:
                     break
-        for step in learned(replace(task, deadline=task.deadline - BOUND_SHARE * left), belief_out=belief):
+        for step in search(replace(task, deadline=task.deadline - BOUND_SHARE * left), belief_out=belief):
             best = _larger(best, step)
             yield step
     yield from proof if best is started else exact_partition(task, start=best, belief=belief, n_jobs=n_jobs)
