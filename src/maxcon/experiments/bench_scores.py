@@ -60,13 +60,24 @@ class Score:
 
 @dataclass(frozen=True)
 class FamilyScore:
-    """A method on a family within a budget: the mean over the cells, its standard error, and in how many it is over."""
+    """A method on a family within a budget.
+
+    Attributes
+    ----------
+    mean, error
+        The mean gap over the cells, and its standard error.
+    ms
+        The mean over the cells of the median time, in milliseconds.
+    cells, over
+        How many cells there are, and in how many the median run exceeds the budget.
+    """
 
     family: str
     budget: float
     method: str
     mean: float
     error: float
+    ms: float
     cells: int
     over: int
 
@@ -175,6 +186,7 @@ def families(scores: Iterable[Score]) -> list[FamilyScore]:
             method=method,
             mean=float(np.mean([each.mean for each in group])),
             error=float(np.sqrt(np.sum([each.error**2 for each in group])) / len(group)),
+            ms=float(np.mean([each.ms for each in group])),
             cells=len(group),
             over=sum(each.over for each in group),
         )

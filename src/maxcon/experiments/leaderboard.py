@@ -28,6 +28,9 @@ from maxcon.experiments.bench_scores import (
 #: What is said of a machine that had other things to do.
 _BUSY = ": the machine was busy, so that within a budget everyone did less than the machine can, and runs were late."
 
+#: The time taken is shown where it is less than this share of the budget.
+_EARLY = 0.6
+
 #: Means this close are equal.
 _TIE = 1e-9
 
@@ -276,9 +279,15 @@ def _family_table(rows: Sequence[FamilyScore]) -> str:
                 continue
             bold = each.mean <= least[budget] + _TIE and each.cells == whole and 2 * each.over <= whole
             over = f" (! {each.over} of {each.cells})" if each.over else ""
-            texts.append(_plain(each.mean, each.error, bold=bold) + over)
+            early = f" ({each.ms:.2g} ms)" if each.ms < _EARLY * budget and not each.over else ""
+            texts.append(_plain(each.mean, each.error, bold=bold) + over + early)
         lines.append(f"| {method} | " + " | ".join(texts) + " |")
-    note = "\n(!: in how many cells the median run exceeds the budget.)\n" if any(each.over for each in rows) else ""
+    notes = []
+    if any(each.over for each in rows):
+        notes.append("!: in how many cells the median run exceeds the budget")
+    if any(each.ms < _EARLY * each.budget for each in rows):
+        notes.append(f"ms: the time taken, where that is less than {_EARLY:.0%} of the budget")
+    note = f"\n({'; '.join(notes)}.)\n" if notes else ""
     return "\n".join(lines) + "\n" + note
 
 

@@ -65,7 +65,8 @@ def draw_family(scores: Sequence[Score], family: str) -> Figure:
             axes.set_xlabel("median time of a fit (ms)")
         for axes in panels[:, 0]:
             axes.set_ylabel("mean gap (inliers)")
-        figure.suptitle(f"{family}: gap to the best known against time", x=0.01, ha="left", fontweight="bold")
+        heading = f"{family}: inliers missing to the best known (0 is best) against time\n"
+        figure.suptitle(heading + _about(mine, drawn), x=0.01, ha="left", fontsize="medium")
         names = [name for name in drawn if name in handles]
         figure.legend(
             [handles[name] for name in names],
@@ -75,6 +76,15 @@ def draw_family(scores: Sequence[Score], family: str) -> Figure:
             frameon=False,
         )
     return figure
+
+
+def _about(scores: Sequence[Score], drawn: Sequence[str]) -> str:
+    """Return what the points are, and who is in the tables only."""
+    counts = sorted({len(each.gaps) for each in scores})
+    number = f"{counts[0]} to {counts[-1]}" if len(counts) > 1 else f"{counts[0]}"
+    left_out = len({each.method for each in scores} - set(drawn))
+    more = f"; {left_out} more methods are in the tables" if left_out else ""
+    return f"means over {number} problems, bars: standard errors; dashed: the budgets{more}"
 
 
 def _panel(axes: Axes, scores: Sequence[Score], cell: CellKey, drawn: Sequence[str]) -> dict[str, Line2D]:
