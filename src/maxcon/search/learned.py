@@ -88,6 +88,10 @@ ROUND_ROOTS = 1.6
 #: of what has been spent; otherwise rounds come first, as they replace it.
 SWAP_FIRST = 0.4
 
+#: Where no more than this share is left out, of no more points than this, the first incumbent is nearly the last one: it
+#: is swapped among all points if so many times as much is left as was spent.
+EASY_SHARE, EASY_POINTS, EASY_LEFT = 0.3, 2000, 1.2
+
 #: The parts of a round of many points. Variations come twice: their walks see a window only, and take little of it.
 PIECES = (*range(VARY), VARY, VARY, BELIEVE, SWAP)
 
@@ -197,9 +201,11 @@ def _search(
         if walk < end - now + OVERRUN * (now - began):
             play_parts(arena, limit, settings, WALK_INCUMBENT, WALK_INCUMBENT + 1)
         now = working_clock()
-        if SWAP_FIRST * (now - began) < end - now < ROUND_ROOTS * (now - began):
+        if _is_easy(counts, task.problem.n_points) and end - now > EASY_LEFT * (now - began):
+            finish_search(arena, limit)
+        elif SWAP_FIRST * (now - began) < end - now < ROUND_ROOTS * (now - began):
             swap_search(arena, limit)
-            now = working_clock()
+        now = working_clock()
         if end - now <= BELIEF_PIECES * took[0]:
             pieces = []
         else:
@@ -275,6 +281,10 @@ def _some(rows: LinearRows, points: NDArray[np.int64]) -> LinearRows:
 
 def _news(counts: NDArray[np.int64], member: NDArray[np.bool_], reported: int) -> Step:
     return Step(subset=member.copy(), refined=True) if counts[SIZE] > reported else Step()
+
+
+def _is_easy(counts: NDArray[np.int64], n_points: int) -> bool:
+    return bool(n_points <= EASY_POINTS and counts[SIZE] >= (1.0 - EASY_SHARE) * n_points)
 
 
 def _is_settled(counts: NDArray[np.int64]) -> bool:
