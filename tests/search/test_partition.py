@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import numpy.typing as npt
 import pytest
 from numba import config
 
 from instances import BUILDERS, synthetic
+from maxcon.minimax.clock import read_clock
 from maxcon.problem import LinearProblem
 from maxcon.search import partition
 from maxcon.search.anytime import Best, Task, make_task, run
 from maxcon.search.partition import PartitionSearch, exact_partition
 from maxcon.search.partition_line import find_line, line_bound, line_intervals
+from maxcon.search.partition_state import allocate_state, state_bytes
 from maxcon.search.partition_tree import HEIGHT, HI, LEFT, LO, PARENT, RIGHT, SIZE, leaf_size, merge_tree
 from oracles import brute_force_consensus, default_slack, highs_minimax, milp_consensus
 
@@ -356,3 +360,22 @@ def test_little_work_is_begun_where_little_time_is_left(monkeypatch):
         assert len(asked) > 5
         assert max(asked) <= most
     assert max(asked) > 10 * partition.LEAST_BUDGET
+
+
+def test_the_memory_of_a_state_is_reckoned_with_all_its_models() -> None:
+    """Each node keeps three models at least, however many nodes and points there are."""
+    for n_points in (300, 3000, 12_000):
+        A, b = synthetic(np.random.default_rng(0), n_points, 3, 0.3)
+        tree = merge_tree(np.abs(b), 7)
+        rows = task_for(A, b, 0.1).rows
+        taken = sum(array.nbytes for array in allocate_state(rows.At, rows.b, 0.1, tree, np.abs(b)))
+        assert 0.7 * taken < state_bytes(3, n_points, tree) < 1.5 * taken
+
+
+def test_no_deal_is_begun_that_would_not_end_in_the_time_left(monkeypatch: pytest.MonkeyPatch) -> None:
+    A, b = synthetic(np.random.default_rng(0), 500, 5, 0.3)
+    task = replace(task_for(A, b, 0.1), deadline=read_clock() + 60.0)
+    monkeypatch.setattr(partition, "FILL_RATE", 1.0)
+    monkeypatch.setattr(partition, "allocate_state", lambda *_: pytest.fail("a deal was begun"))
+    steps = list(exact_partition(task, start=np.abs(b - A @ np.linalg.lstsq(A, b, rcond=None)[0]) < 0.01, n_jobs=1))
+    assert steps[-1].upper_bound == 500

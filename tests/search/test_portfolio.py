@@ -57,15 +57,30 @@ def test_a_proof_in_between_has_its_time_and_the_search_the_rest(monkeypatch):
         yield Step(upper_bound=29)
 
     monkeypatch.setattr(portfolio, "exact_partition", fruitless)
-    steps = list(portfolio._learned_and_proof(task := task_for(0.15, LONG), briefly))
+    steps = list(portfolio._learned_and_proof(task_for(0.15, LONG), briefly))
     place = next(k for k, step in enumerate(steps) if step.upper_bound == 29)
     assert steps[place - 1].settled
     assert place + 1 < len(steps)
     sets = [step.subset for step in steps[:place] if step.subset is not None]
-    assert given[0] <= portfolio.PROOF_TIMES * portfolio.reckoned_proof(sets[-1]) < task.seconds_left()
+    assert portfolio.PROOF_TIMES * portfolio.reckoned_proof(sets[-1]) < portfolio.LEAST_SHARE * LONG
+    assert given[0] == pytest.approx(portfolio.LEAST_SHARE * LONG, rel=0.05)
     monkeypatch.setattr(portfolio, "PROOF_TIMES", 1e9)
     list(portfolio._learned_and_proof(task_for(0.15, LONG), briefly))
     assert given[1] == pytest.approx(portfolio.PROOF_SHARE * LONG, rel=0.05)
+
+
+@compiled_only
+def test_a_proof_that_does_not_end_gives_the_time_back(monkeypatch):
+    """It is the caller who stops the exact search, which goes on in small steps when its time is over."""
+    monkeypatch.setattr(portfolio, "PROOF_RATE", 1e-18)
+    task = task_for(0.6, 1.0, n_points=300, d=8)
+    proving = []
+    for step in portfolio._learned_and_proof(task, learned):
+        proving.append(step.upper_bound is not None)
+        if task.over():
+            break
+    assert any(proving)
+    assert not proving[-1]
 
 
 def test_the_reckoned_time_grows_with_points_and_outliers():

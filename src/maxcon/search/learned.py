@@ -38,12 +38,12 @@ from maxcon.search.learned_kernels import (
 from maxcon.search.learned_memory import (
     AGREEMENT,
     DOUBTS,
-    IN_WINDOW,
     N_COUNTS,
     ROUND,
     SIZE,
     STALL,
     SWAPPED,
+    WHOLLY,
     Arena,
     allocate_arena,
 )
@@ -88,8 +88,8 @@ ROUND_ROOTS = 1.6
 #: of what has been spent; otherwise rounds come first, as they replace it.
 SWAP_FIRST = 0.4
 
-#: Where no more than this share is left out, of no more points than this, the first incumbent is nearly the last one: it
-#: is swapped among all points if so many times as much is left as was spent.
+#: Where no more than this share is left out, of no more points than this, the first incumbent is nearly the last one:
+#: it is swapped among all points if so many times as much is left as was spent.
 EASY_SHARE, EASY_POINTS, EASY_LEFT = 0.3, 2000, 1.2
 
 #: The parts of a round of many points. Variations come twice: their walks see a window only, and take little of it.
@@ -229,7 +229,8 @@ def _search(
             yield replace(_news(counts, member, reported), settled=True)
             reported, spoken = int(counts[SIZE]), (now := working_clock())
         # A swap among all of many points takes some rounds' time.
-        if counts[SWAPPED] == IN_WINDOW and counts[STALL] >= settings.patience and end - now > now - began:
+        stalled = len(pieces) > 1 and counts[SWAPPED] != WHOLLY and counts[STALL] >= settings.patience
+        if stalled and end - now > now - began:
             finish_search(arena, limit)
             now = working_clock()
     if end == np.inf:

@@ -47,7 +47,6 @@ PROPOSE, WALK, WALK_INCUMBENT, VARY, BELIEVE, SWAP, PARTS = 0, 1, 3, 4, 5, 6, 7
 #: Two starts are the same where their residuals differ by less than this many limits, root mean square.
 SAME_START = 0.1
 
-
 #: A walk is not begun where its set would have to grow by more than this to be worth it.
 FEW_MORE = 3
 
@@ -149,7 +148,7 @@ def walk_from(search: Search, limit: float, settings: Settings, x: NDArray[np.fl
     """Walk down from model x, add back, and keep what was found if it is more than the incumbent.
 
     Of many points, the walk sees those of a window (see `window`). A `loyal` walk removes no point of the incumbent:
-    from its model it ends at a set that holds it.
+    from its model it ends at a set that holds it, or what the window shows of it.
     """
     ws, walk, counts, r = search.ws, search.walk, search.counts, search.trial
     N = r.shape[0]
@@ -359,7 +358,7 @@ def place_incumbent(search: Search, limit: float) -> bool:
 
 @kernel
 def swap_window(search: Search, limit: float) -> None:
-    """Swap among the points of the incumbent's window; a set found so is refined among all points."""
+    """Swap among the points of the incumbent's window; what is found gets all points that its model explains."""
     ws, walk, member, r = search.ws, search.walk, search.member, search.trial
     compute_residuals(ws.At, ws.b, search.x, r)
     m, _ = choose_window(r, CORE * limit, OUTER * limit, walk.points)

@@ -39,6 +39,7 @@ from maxcon.search.partition_state import (
     SearchState,
     allocate_state,
     grow,
+    model_bytes,
     state_bytes,
 )
 from maxcon.search.partition_tree import HEIGHT, HI, LEFT, LO, RIGHT, SIZE, MergeTree, leaf_size, merge_tree
@@ -53,6 +54,9 @@ LEAST_BUDGET, SPEED = 2_000, 3e7
 
 #: All threads together may take so much memory, in bytes; beyond, the search ends with what it has proven.
 MOST_BYTES = 4 << 30
+
+#: So many bytes of new memory are written in a second: no deal is begun whose models cannot be in the time left.
+FILL_RATE = 1e9
 
 #: Stands beside what `advance` returns: the work allowed is spent.
 SPENT = 3
@@ -245,12 +249,14 @@ class PartitionSearch:
         """Deal the points into groups by their residuals under the incumbent, and allocate a state for each thread."""
         rows = self.task.rows
         leaf = leaf_size(len(rows.b), len(rows.At), self.n_outliers) if self._leaf is None else self._leaf
-        self._work_before, self._expanded_before = self._work(), self.expanded
-        self._tree = merge_tree(residuals, leaf)
-        bytes_each = state_bytes(len(rows.At), len(rows.b), self._tree)
-        self._n_jobs = min(self._n_jobs, MOST_BYTES // bytes_each)
-        if self._n_jobs == 0:
+        tree = merge_tree(residuals, leaf)
+        bytes_each = state_bytes(len(rows.At), len(rows.b), tree)
+        n_jobs = min(self._n_jobs, MOST_BYTES // bytes_each)
+        filled = n_jobs * model_bytes(len(rows.b), len(tree.nodes))
+        if n_jobs == 0 or (self.task.deadline < np.inf and filled > FILL_RATE * self.task.seconds_left()):
             raise _SpentError
+        self._work_before, self._expanded_before = self._work(), self.expanded
+        self._tree, self._n_jobs, self._states = tree, n_jobs, []  # the states before go before new ones come
         self._states = [
             allocate_state(rows.At, rows.b, self.task.limit, self._tree, residuals) for _ in range(self._n_jobs)
         ]

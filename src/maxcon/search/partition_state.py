@@ -184,7 +184,7 @@ def allocate_state(
         kept=np.ones(N, dtype=np.uint8),
         held=np.zeros(N, dtype=np.uint8),
         enforced=np.zeros(N, dtype=np.int64),
-        models=np.ones((T + 1, int(np.clip(MODEL_BYTES // (T * N), 3, MODELS_KEPT)), N), dtype=np.uint8),
+        models=np.ones((T + 1, _models_kept(N, T), N), dtype=np.uint8),
         best_out=np.ones(N, dtype=np.uint8),
         found_out=np.ones(N, dtype=np.uint8),
         registers=np.zeros(N_REGISTERS, dtype=np.int64),
@@ -220,8 +220,18 @@ def state_bytes(n_params: int, n_points: int, tree: MergeTree) -> int:
     n, heights = n_params + 1, int(tree.nodes[0, HEIGHT]) + 1
     programmes = heights * 2 * n_points * (n_params + 7)
     stack = 64 * (N_FRAME_COLUMNS + 3 * n * (n + 2) + 2 * n_points)
-    models = min(MODEL_BYTES, len(tree.nodes) * n_points * MODELS_KEPT)
-    return 8 * (programmes + stack + n_points * (n_params + 20) + 64 * len(tree.nodes)) + models
+    rest = programmes + stack + n_points * (n_params + 20) + 64 * len(tree.nodes)
+    return 8 * rest + model_bytes(n_points, len(tree.nodes))
+
+
+def model_bytes(n_points: int, n_nodes: int) -> int:
+    """Return how many bytes the models of the nodes take; `allocate_state` writes them all, which takes its time."""
+    return (n_nodes + 1) * _models_kept(n_points, n_nodes) * n_points
+
+
+def _models_kept(n_points: int, n_nodes: int) -> int:
+    """Return how many models each node keeps: of many nodes few, but three at least, whatever that takes."""
+    return int(np.clip(MODEL_BYTES // (n_nodes * n_points), 3, MODELS_KEPT))
 
 
 def grow(state: SearchState) -> SearchState:

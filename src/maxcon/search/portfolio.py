@@ -58,8 +58,8 @@ ALL_LEARNED = 2e-4
 PROOF_RATE, PROOF_GROWTH = 5e-9, 10.0
 
 #: In little time a proof is tried where it is reckoned to take at most this share of what is left. It gets up to that,
-#: and up to so many times as long as was reckoned: beyond, it seldom ends.
-PROOF_SHARE, PROOF_TIMES = 0.6, 5.0
+#: and up to so many times as long as was reckoned, as it seldom ends beyond, but a least share in any case.
+PROOF_SHARE, PROOF_TIMES, LEAST_SHARE = 0.6, 5.0, 0.25
 
 #: In more time, where a proof is reckoned to take so many times what is left, it is out of reach. The last part of the
 #: time then goes to a bound, and `BRIEF_SECONDS` already before the search goes on, if they are at most such a share.
@@ -133,10 +133,12 @@ def _learned_and_proof(task: Task, search: Method) -> Iterator[Step]:
         if step.settled:
             left, reckoned = task.seconds_left(), reckoned_proof(best)
             if reckoned <= PROOF_SHARE * left:
-                spent = left - min(PROOF_SHARE * left, PROOF_TIMES * reckoned)
-                yield from exact_partition(
-                    replace(task, deadline=task.deadline - spent), start=best, belief=belief, n_jobs=1
-                )
+                spent = left - min(PROOF_SHARE * left, max(PROOF_TIMES * reckoned, LEAST_SHARE * left))
+                own = replace(task, deadline=task.deadline - spent)
+                for news in exact_partition(own, start=best, belief=belief, n_jobs=1):
+                    yield news
+                    if own.over():  # it does not end by itself
+                        break
 
 
 def reckoned_proof(inliers: NDArray[np.bool_]) -> float:
@@ -170,11 +172,11 @@ def _long(task: Task, left: float, n_jobs: int, search: Method) -> Iterator[Step
     if not np.isfinite(left):
         yield from exact_partition(task, start=best, belief=belief, n_jobs=1, max_work=BRIEF_WORK)
         return
-    proof, started = exact_partition(task, start=best, belief=belief, n_jobs=n_jobs), best
     if reckoned_proof(best) > HOPELESS * task.seconds_left():
         if BRIEF_SHARE * task.seconds_left() >= BRIEF_SECONDS:
             until = task.seconds_left() - BRIEF_SECONDS
-            for step in proof:  # gone on with below
+            # One thread: those of an interrupted search go on beside what comes next.
+            for step in exact_partition(task, start=best, belief=belief, n_jobs=1):
                 best = _larger(best, step)
                 yield step
                 if task.seconds_left() <= until:
@@ -182,7 +184,7 @@ def _long(task: Task, left: float, n_jobs: int, search: Method) -> Iterator[Step
         for step in search(replace(task, deadline=task.deadline - BOUND_SHARE * left), belief_out=belief):
             best = _larger(best, step)
             yield step
-    yield from proof if best is started else exact_partition(task, start=best, belief=belief, n_jobs=n_jobs)
+    yield from exact_partition(task, start=best, belief=belief, n_jobs=n_jobs)
 
 
 def _larger(best: NDArray[np.bool_], step: Step) -> NDArray[np.bool_]:
