@@ -47,7 +47,6 @@ import json  # noqa: E402
 import platform  # noqa: E402
 import subprocess  # noqa: E402
 import sys  # noqa: E402
-import time  # noqa: E402
 from collections.abc import Callable  # noqa: E402
 from typing import Any  # noqa: E402
 
@@ -57,6 +56,7 @@ from numpy.typing import NDArray  # noqa: E402
 
 from maxcon.agent.search_networks import shipped_search_networks  # noqa: E402
 from maxcon.experiments.search_instances import make_problem  # noqa: E402
+from maxcon.minimax.clock import processor_time, read_clock  # noqa: E402
 from maxcon.minimax.rows import whiten  # noqa: E402
 from maxcon.minimax.sums import dot  # noqa: E402
 from maxcon.problem import LinearProblem  # noqa: E402
@@ -335,9 +335,9 @@ def rates() -> dict[str, float]:
     fastest = dict.fromkeys(work, 0.0)
     for _ in range(40):
         for name, (call, multiply_adds) in work.items():
-            began = time.perf_counter()
+            began = read_clock()
             call()
-            fastest[name] = max(fastest[name], multiply_adds / (time.perf_counter() - began))
+            fastest[name] = max(fastest[name], multiply_adds / (read_clock() - began))
     return fastest
 
 
@@ -347,13 +347,13 @@ def time_parts(problem: LinearProblem, threshold: float, rounds: int, repeats: i
     for _ in range(repeats):
         parts: list[tuple[str, float, int]] = []
         gc.disable()
-        last = time.perf_counter()
+        last = read_clock()
 
         def log(name: str, size: int, parts: list[tuple[str, float, int]] = parts) -> None:
             nonlocal last
-            now = time.perf_counter()
+            now = read_clock()
             parts.append((name, now - last, size))
-            last = time.perf_counter()
+            last = read_clock()
 
         play_fit(problem, threshold, rounds, log)
         gc.enable()
@@ -368,10 +368,10 @@ def whole(problem: LinearProblem, threshold: float, rounds: int, repeats: int) -
     for _ in range(repeats):
         fresh = LinearProblem._checked(problem.A, problem.b, problem.family)
         gc.disable()
-        began = time.perf_counter()
+        began = read_clock()
         task: Task = make_task(fresh, threshold, np.random.default_rng(0))
         steps = [step.subset for step in method.learned(task, rounds=rounds) if step.subset is not None]
-        least = min(least, time.perf_counter() - began)
+        least = min(least, read_clock() - began)
         gc.enable()
         size = int(np.count_nonzero(steps[-1]))
     return least, size
@@ -414,12 +414,13 @@ def main() -> None:
     if options.count:
         count(options)
         return
-    print(f"{platform.processor() or platform.machine()}, one thread; {options.instances} instances a cell")
+    print(f"{platform.processor() or platform.machine()}, one thread, CPU time; {options.instances} instances a cell")
     counts = counts_of_another_process(options)
-    measured = rates()
-    print("multiply-adds a ns: " + ", ".join(f"{name} {1e-9 * value:.2f}" for name, value in measured.items()))
-    for cell in options.cells:
-        show(cell, options, counts[cell], max(measured.values()))
+    with processor_time():
+        measured = rates()
+        print("multiply-adds a ns: " + ", ".join(f"{name} {1e-9 * value:.2f}" for name, value in measured.items()))
+        for cell in options.cells:
+            show(cell, options, counts[cell], max(measured.values()))
 
 
 if __name__ == "__main__":
