@@ -185,8 +185,8 @@ def main() -> None:
     options = parser.parse_args()
     print(
         f"{platform.processor() or platform.machine()}, one thread, CPU time; {options.rate:.0%} outliers, "
-        f"{options.instances} x {options.seeds} runs; ms to within {options.within:g}% of the best known, and that over "
-        "N log N"
+        f"{options.instances} x {options.seeds} runs; ms to within {options.within:g}% of the best known, and that "
+        "over N log N"
     )
     with processor_time():
         for name in METHODS:
