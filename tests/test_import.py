@@ -13,7 +13,18 @@ PACKAGE = Path(maxcon.__file__).parent
 HEAVY = ("numba", "torch", "scipy", "matplotlib", "sklearn", "cv2", "gymnasium")
 
 
-CORE = {"problem", "datasets", "minimax", "tree", "agent", "search", "certification", "fitting", "certifying"}
+CORE = {
+    "waiting",
+    "problem",
+    "datasets",
+    "minimax",
+    "tree",
+    "agent",
+    "search",
+    "certification",
+    "fitting",
+    "certifying",
+}
 NEEDS_EXTRAS = {
     "tree/environments.py",
     "tree/registration.py",
@@ -87,3 +98,14 @@ def test_no_public_name_is_a_module():
         path.parent.name for path in PACKAGE.glob("*/__init__.py")
     }
     assert not modules & set(maxcon.__all__)
+
+
+def test_documented_subpackages_are_attributes():
+    """``import maxcon; maxcon.vision.polish_fundamental``, whatever was imported before."""
+    packages = {path.parent.name for path in PACKAGE.glob("*/__init__.py")} - {"cli"}
+    assert set(maxcon._PACKAGES) == packages
+    assert packages <= set(dir(maxcon))
+    assert not packages & set(maxcon.__all__)
+    for name in sorted(packages):
+        run(f"import maxcon\nassert maxcon.{name}.__name__ == 'maxcon.{name}'")
+    run("import maxcon\nassert callable(maxcon.vision.polish_fundamental)")

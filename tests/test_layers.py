@@ -12,6 +12,7 @@ PACKAGE = Path(maxcon.__file__).parent
 
 #: From the bottom of the house to the top; each may import from those before it.
 LAYERS = [
+    "waiting",
     "problem",
     "datasets",
     "minimax",
@@ -22,6 +23,7 @@ LAYERS = [
     "fitting",
     "certifying",
     "vision",
+    "compiling",
     "estimators",
     "experiments",
     "cli",
@@ -38,7 +40,7 @@ EXTRAS = {
     "agent/learn.py": {"torch"},
     "agent/train.py": {"torch"},
 }
-CORE = ["problem", "datasets", "minimax", "tree", "agent", "search", "certification", "fitting", "certifying"]
+CORE = LAYERS[: LAYERS.index("vision")]
 
 FILES = sorted(path for path in PACKAGE.rglob("*.py") if path != PACKAGE / "__init__.py")
 

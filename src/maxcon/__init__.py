@@ -9,8 +9,18 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from maxcon import agent as agent
+    from maxcon import certification as certification
+    from maxcon import datasets as datasets
+    from maxcon import experiments as experiments
+    from maxcon import minimax as minimax
+    from maxcon import problem as problem
+    from maxcon import search as search
+    from maxcon import tree as tree
+    from maxcon import vision as vision
     from maxcon.certifying import certify as certify
     from maxcon.certifying import write_certificate as write_certificate
+    from maxcon.compiling import compile_kernels as compile_kernels
     from maxcon.fitting import fit as fit
     from maxcon.fitting import methods as methods
     from maxcon.minimax import MinimaxFit as MinimaxFit
@@ -38,6 +48,7 @@ _HOME = {
     "MinimaxFit": "maxcon.minimax",
     "alternative_optima": "maxcon.search.alternatives",
     "certify": "maxcon.certifying",
+    "compile_kernels": "maxcon.compiling",
     "consensus_curve": "maxcon.search.threshold_curve",
     "find_fundamental": "maxcon.vision",
     "fit": "maxcon.fitting",
@@ -49,10 +60,15 @@ _HOME = {
     "write_certificate": "maxcon.certifying",
 }
 
+#: The subpackages that are reached as attributes, without an import of their own.
+_PACKAGES = ("agent", "certification", "datasets", "experiments", "minimax", "problem", "search", "tree", "vision")
+
 __all__ = ["__version__", *sorted(_HOME)]  # noqa: PLE0604
 
 
 def __getattr__(name: str) -> Any:
+    if name in _PACKAGES:
+        return import_module(f"maxcon.{name}")
     if name not in _HOME:
         raise AttributeError(f"module 'maxcon' has no attribute {name!r}")
     value = getattr(import_module(_HOME[name]), name)
@@ -61,4 +77,4 @@ def __getattr__(name: str) -> Any:
 
 
 def __dir__() -> list[str]:
-    return sorted(__all__)
+    return sorted({*__all__, *_PACKAGES})

@@ -3,12 +3,14 @@
 import numpy as np
 import pytest
 import torch
+from safetensors.numpy import save_file
 
 import maxcon
 from maxcon.agent.config import paper, shipped
 from maxcon.agent.graph import batched_neighbour_max, neighbour_graph, neighbour_max, point_features, scatter_gradient
 from maxcon.agent.inference import Agent, pack, q_values
 from maxcon.agent.network import QNetwork
+from maxcon.agent.search_networks import save_search_networks, shipped_search_networks
 from maxcon.agent.shipped import agent_file, agent_names, agent_path, model_card, shipped_agent
 from maxcon.agent.weights import load_weights, save_weights
 from maxcon.datasets.synthetic import synthetic_hyperplane
@@ -193,6 +195,12 @@ def test_broken_weight_files_are_refused(tmp_path):
     (tmp_path / "bad.safetensors").write_bytes(b"hello, this is not it")
     with pytest.raises(ValueError, match="weights must be a safetensors file"):
         load_weights(tmp_path / "bad.safetensors")
+    save_search_networks(shipped_search_networks(), tmp_path / "search.safetensors")
+    with pytest.raises(ValueError, match="holds a pair of search networks: these are for the method 'learned'"):
+        load_weights(tmp_path / "search.safetensors")
+    save_file({"a": np.zeros(3)}, tmp_path / "other.safetensors")
+    with pytest.raises(ValueError, match="holds no configuration"):
+        load_weights(tmp_path / "other.safetensors")
 
 
 def test_neighbour_max_and_its_gradient_against_the_obvious():

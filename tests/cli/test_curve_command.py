@@ -100,6 +100,23 @@ def test_too_many_parameters(fails, tmp_path):
     assert "at most 3 independent parameters" in fails("curve", "p.npy", "--model", "hyperplane")
 
 
+def test_progress_where_there_is_no_terminal(run, points, monkeypatch):
+    monkeypatch.setattr("maxcon.cli.curve.SILENCE", 0.0)
+    lines = run("curve", points, "--model", "line").stderr.splitlines()
+    lines = [line for line in lines if line.startswith("searching: ")]
+    done = [int(line.split()[1]) for line in lines]
+    assert done == sorted(done)
+    assert lines[-1].startswith(f"searching: {done[-1]} of 40 breakpoints proven, ")
+    assert done[-1] == 40
+    monkeypatch.setattr("maxcon.cli.curve.SILENCE", 1e9)
+    assert "searching" not in run("curve", points, "--model", "line").stderr
+
+
+def test_the_help_says_how_long_it_takes(run):
+    text = " ".join(run("curve", "--help").stdout.split())
+    assert "Lines take milliseconds. Planes of hundreds of points take minutes" in text
+
+
 def test_ctrl_c_shows_what_is_known(run, points, monkeypatch):
     def slow(_task):
         threading.Timer(0.05, signal.pthread_kill, (threading.main_thread().ident, signal.SIGINT)).start()

@@ -3,6 +3,8 @@ import dataclasses
 import json
 import os
 import signal
+import subprocess
+import sys
 import threading
 import time
 
@@ -190,6 +192,35 @@ def test_ctrl_c_shows_the_best_so_far(run, points, monkeypatch):
     assert "32 of 40" in result.stdout  # refined from the two points
     assert os.path.exists("out.json")
     assert signal.getsignal(signal.SIGINT) is before
+
+
+@pytest.mark.skipif(os.name != "posix", reason="sends SIGINT")
+def test_ctrl_c_ends_a_milp_at_once(tmp_path):
+    """In a process of its own, whose end HiGHS, which would go on for a minute, neither delays nor breaks."""
+    rng = np.random.default_rng(0)
+    X = rng.uniform(-1, 1, (120, 9))
+    X[:70, 8] = X[:70, :8].sum(axis=1) + rng.uniform(-0.1, 0.1, 70)
+    np.save(tmp_path / "p.npy", X)
+    code = """if True:
+        import os, signal, sys, threading
+        import scipy.optimize
+        solve = scipy.optimize.milp
+        def milp(*args, **options):
+            threading.Timer(0.5, os.kill, (os.getpid(), signal.SIGINT)).start()
+            return solve(*args, **options)
+        scipy.optimize.milp = milp
+        from maxcon.cli import main
+        main(["fit", "p.npy", "--model", "hyperplane", "--threshold", "0.1", "--method", "milp", "--json", "out.json"])
+    """
+    process = subprocess.run(
+        [sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, timeout=300, check=False
+    )
+    assert process.returncode == 130, process.stderr
+    assert "stopped by Ctrl-C" in process.stdout
+    assert "wrote out.json" in process.stdout
+    record = json.loads((tmp_path / "out.json").read_text())
+    assert record["n_inliers"] >= 60
+    assert record["seconds"] < 30  # HiGHS has a minute
 
 
 def test_many_outliers_are_only_counted(run, tmp_path):

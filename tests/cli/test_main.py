@@ -12,6 +12,7 @@ COMMANDS = (
     "alternatives",
     "demo",
     "methods",
+    "compile",
     "agents",
     "train",
     "evaluate",

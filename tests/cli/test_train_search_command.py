@@ -53,6 +53,12 @@ def test_on_tables_of_ones_own(run, fails, tmp_path):
     assert "has none" in fails("train", "search", "--data", tmp_path, "--threshold", 0.1, "--out", "other")
 
 
+def test_the_help_tells_what_each_kind_of_training_writes(run):
+    text = " ".join(run("train", "--help").stdout.split())
+    assert "For an agent DIR gets config.json, log.jsonl" in text
+    assert "DIR gets checkpoint.pt, from which it goes on as well, and after every round search.safetensors" in text
+
+
 def test_learners_and_families_must_fit(fails):
     assert "--learner dqn teaches the EdgeConv agents" in fails("train", "search", "--learner", "dqn")
     assert "--learner optima teaches search, not line" in fails("train", "line", "--learner", "optima")

@@ -14,9 +14,9 @@ import scipy.optimize
 import maxcon
 from maxcon.certification import issue, save
 from maxcon.certification.certificate import dumps
-from maxcon.certification.rerun import solver_at_work
 from maxcon.search.anytime import make_task
 from maxcon.search.witness import make_witness
+from maxcon.waiting import solver_at_work
 
 
 @pytest.fixture

@@ -1,9 +1,14 @@
 """The MILP by HiGHS: the optimum of enumerating subsets, from boxes that hold what they promise to hold."""
 
 import itertools
+import os
+import signal
+import threading
+import time
 
 import numpy as np
 import pytest
+import scipy.optimize
 from scipy.optimize import linprog
 
 from instances import BUILDERS, synthetic
@@ -16,6 +21,7 @@ from maxcon.search.anytime import Best, Task, make_task, run
 from maxcon.search.milp import LARGEST_M, milp
 from maxcon.search.milp_box import model_box
 from maxcon.search.sweep import exact_sweep
+from maxcon.waiting import solver_at_work
 from oracles import brute_force_consensus, highs_minimax
 
 #: Families whose thresholds are so far below their residuals that no M is small enough for HiGHS.
@@ -118,6 +124,32 @@ def test_called_again_for_longer_where_there_is_no_limit(monkeypatch):
     steps = [step for step in milp(task_of(A, b, 0.1)) if step.upper_bound is not None]
     assert len(steps) > 1
     assert steps[-1].upper_bound == 53
+
+
+@pytest.mark.skipif(os.name != "posix", reason="sends SIGINT")
+def test_ctrl_c_leaves_the_solver_and_keeps_the_best(monkeypatch):
+    """HiGHS does not look up, here for ten seconds: what the short peel before it has found is returned at once."""
+    done = threading.Event()
+    solve = scipy.optimize.milp
+
+    def solver(*_args, **_options):
+        signal.pthread_kill(threading.main_thread().ident, signal.SIGINT)
+        done.wait(10)
+
+    monkeypatch.setattr("scipy.optimize.milp", solver)
+    A, b = synthetic(np.random.default_rng(0), 30, 3, 0.2)
+    began = time.monotonic()
+    best = judged(task_of(A, b, 0.1))
+    assert time.monotonic() - began < 9
+    assert best.interrupted
+    assert best.size >= 24
+    assert best.upper_bound == 30
+    assert solver_at_work()
+    monkeypatch.setattr("scipy.optimize.milp", solve)
+    assert judged(task_of(A, b, 0.1)).gap == 0  # beside the one that is left to its own
+    done.set()
+    while solver_at_work():
+        time.sleep(0.01)
 
 
 def test_options():

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from maxcon.datasets import synthetic_two_view
-from maxcon.vision import enforce_rank_two, sampson_distances, symmetric_epipolar_distances
+from maxcon.vision import enforce_rank_two, fundamental_problem, sampson_distances, symmetric_epipolar_distances
 
 
 def slow_distances(F, p, q):
@@ -93,3 +93,21 @@ def test_errors_name_the_argument(arguments, error, message):
     for distances in (sampson_distances, symmetric_epipolar_distances):
         with pytest.raises(error, match=message):
             distances(*arguments)
+
+
+def test_points_as_opencv_has_them():
+    """Shape (N, 1, 2), as arrays or lists, is taken by everything that takes matches; any other third axis is not."""
+    scene = synthetic_two_view(30, 0.2, np.random.default_rng(2))
+    x1, x2 = scene.x1[:, None, :], scene.x2[:, None, :].astype(np.float32)
+    for distances in (sampson_distances, symmetric_epipolar_distances):
+        expected = distances(scene.F, scene.x1, x2[:, 0])
+        np.testing.assert_array_equal(distances(scene.F, x1, x2), expected)
+        np.testing.assert_array_equal(distances(scene.F, x1.tolist(), x2), expected)
+    expected = fundamental_problem(scene.x1, scene.x2, chart="F32=1")
+    np.testing.assert_array_equal(
+        fundamental_problem(x1, scene.x2, chart="F32=1").problem.A,
+        expected.problem.A,
+    )
+    for wrong in (scene.x1[:, :, None], np.stack([scene.x1, scene.x1], axis=1), x1[:, :, :, None], x1[:, :, :1]):
+        with pytest.raises(ValueError, match="x1 must "):
+            sampson_distances(scene.F, wrong, scene.x2)

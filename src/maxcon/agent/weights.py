@@ -42,6 +42,11 @@ def load_weights(path: Path) -> tuple[dict[str, NDArray[np.float32]], AgentConfi
         raise ValueError(f"weights must name an agent file, but there is no file {str(path)!r}") from None
     except Exception as error:  # safetensors raises a class of its own for each broken header
         raise ValueError(f"weights must be a safetensors file, but {str(path)!r} is not: {error}") from None
+    if "config" not in metadata and any(name.startswith("peel.") for name in tensors):
+        raise ValueError(
+            f"weights must be an agent file of maxcon, but {str(path)!r} holds a pair of search networks: these are "
+            "for the method 'learned' and its option 'network' (--method learned --option network=FILE)"
+        )
     if "config" not in metadata:
         raise ValueError(f"weights must be an agent file of maxcon, but {str(path)!r} holds no configuration")
     try:

@@ -9,33 +9,25 @@ from __future__ import annotations
 
 import itertools
 import math
-import threading
 import time
-from collections.abc import Callable
 from dataclasses import dataclass
 from fractions import Fraction
 from functools import partial
-from typing import Any, Literal, TypeVar
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from maxcon.certification.exact import ExactData, independent_columns, within
+from maxcon.waiting import interruptible
 
 Floats = NDArray[np.float64]
-T = TypeVar("T")
 
 #: The number of d-subsets of a group from which a box is derived is at most this.
 MOST_SUBSETS = 20_000
 
 #: A d-subset whose matrix has a larger condition number confines nothing.
 SINGULAR = 1e10
-
-#: The name of the thread in which HiGHS works.
-SOLVER = "maxcon rerun"
-
-#: Seconds between two looks at whether Ctrl-C was pressed, where waiting would not be cut short by it.
-LOOK = 0.1
 
 #: So many places that are too deep are looked at; if none of them is, rounding makes a decision impossible.
 MOST_TRIALS = 100
@@ -88,7 +80,7 @@ def prove_again(A: Floats, b: Floats, limit: float, bound: int, time_limit: floa
     -------
     Rerun
         "unfinished" where the time is over, or Ctrl-C was pressed: then a solver at work is left to its own, and ends
-        with the process or at its time limit (`solver_at_work`).
+        with the process or at its time limit (`maxcon.waiting.solver_at_work`).
     """
     began = time.perf_counter()
     d = A.shape[1]
@@ -110,15 +102,6 @@ def prove_again(A: Floats, b: Floats, limit: float, bound: int, time_limit: floa
 def load_solver() -> None:
     """Import what a rerun needs ahead of it: extension modules may swallow a Ctrl-C that meets their import."""
     from scipy.optimize import linprog, milp  # noqa: F401, PLC0415  (only a rerun needs them)
-
-
-def solver_at_work() -> bool:
-    """Whether a solver that Ctrl-C has left to its own is still at work.
-
-    It cannot be told to stop. Should it end while the interpreter is being taken down, its thread would abort the
-    process, with a core dump: a program that ends nevertheless had better do so by `os._exit`.
-    """
-    return any(thread.name == SOLVER for thread in threading.enumerate())
 
 
 # ------------------------------------------------------------------------------------------------- two
@@ -235,7 +218,7 @@ def _milp(A: Floats, b: Floats, limit: float, bound: int, deadline: float) -> in
         if left <= 0:
             raise _Undecided("the time limit was reached")
         solve = partial(milp, count, integrality=count, bounds=bounds, constraints=tuple(constraints))
-        answer = _interruptible(partial(solve, options={"time_limit": left}))
+        answer = interruptible(partial(solve, options={"time_limit": left}))
         if answer.status == 2:
             return 0
         if answer.x is None:
@@ -253,26 +236,6 @@ def _milp(A: Floats, b: Floats, limit: float, bound: int, deadline: float) -> in
         cut = np.zeros(d + N)
         cut[d + refuted] = 1.0
         constraints.append(LinearConstraint(cut[None, :], lb=1.0))
-
-
-def _interruptible(function: Callable[[], T]) -> T:
-    """Call `function` such that Ctrl-C ends the wait for it: HiGHS itself would not look up before it is done."""
-    returned: list[T] = []
-    raised: list[BaseException] = []
-
-    def work() -> None:
-        try:
-            returned.append(function())
-        except BaseException as error:  # for the caller, whatever it is
-            raised.append(error)
-
-    thread = threading.Thread(target=work, name=SOLVER, daemon=True)
-    thread.start()
-    while thread.is_alive():
-        thread.join(LOOK)
-    if raised:
-        raise raised[0]
-    return returned[0]
 
 
 def _chebyshev(A: Floats, b: Floats) -> tuple[Floats, NDArray[np.intp]]:

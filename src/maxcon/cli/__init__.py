@@ -20,6 +20,7 @@ _COMMANDS = (
     "verify",
     "demo",
     "methods",
+    "compile",
     "agents",
     "train",
     "evaluate",

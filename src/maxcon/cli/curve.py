@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import time
 from collections.abc import Mapping
 from dataclasses import fields
 from pathlib import Path
@@ -26,6 +27,9 @@ from maxcon.problem.tolerance import ABSOLUTE_SLACK
 if TYPE_CHECKING:
     from maxcon.problem import LinearProblem
     from maxcon.search.threshold_curve import ConsensusCurve
+
+#: Where there is no terminal, a line says after so many seconds how far it is, and again.
+SILENCE = 5.0
 
 #: So many breakpoints are shown, about; of more, an even choice. JSON has all.
 SHOWN = 20
@@ -62,7 +66,11 @@ def command(
 
     FILE is read as `maxcon fit` reads it. The model may have up to three parameters: a line, a plane, or a hyperplane
     over one or two columns. The table lists from which threshold on a consensus is reached, and which thresholds are
-    knees: where less would lose many points and more would win few.
+    knees: where less would lose many points and more would win few. (Knees depend on the range from --from to --to:
+    nothing outside is looked at, and the first tenth of the points and the last breakpoint in it are none.)
+
+    Lines take milliseconds. Planes of hundreds of points take minutes, most of them for the smallest thresholds: give
+    --from, or --time-limit, after which the table shows what is proven and, beside it, what is possible at most.
 
     The JSON object holds the file, the model's family, the columns, the positions of the knees and every field of
     maxcon.ConsensusCurve: counts, thresholds, proven_to, models, n_at_low, low, high, n_points, scale, complete,
@@ -113,13 +121,21 @@ def result_json(about: Mapping[str, Any], result: Any) -> bytes:
 
 
 def _compute(problem: LinearProblem, thresholds: tuple[float, float], time_limit: float | None) -> ConsensusCurve:
-    """Compute the curve, showing on a terminal how far it is."""
+    """Compute the curve, showing how far it is: a terminal always, anything else now and then."""
     from maxcon.search.threshold_curve import consensus_curve  # noqa: PLC0415
 
-    with console(stderr=True).status("searching ...") as status:
+    err = console(stderr=True)
+    began = said = time.monotonic()
+    with err.status("searching ...") as status:
 
         def show(done: int, total: int) -> None:
-            status.update(f"searching: {done} of {total} thresholds proven")
+            nonlocal said
+            now = time.monotonic()
+            words = f"searching: {done} of {total} breakpoints proven, {duration(now - began)} so far"
+            status.update(words)
+            if not err.is_terminal and now - said >= SILENCE:
+                said = now
+                click.echo(words, err=True)
 
         with reported():
             return consensus_curve(problem, thresholds, time_limit=time_limit, callback=show)

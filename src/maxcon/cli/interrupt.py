@@ -2,11 +2,17 @@
 
 from __future__ import annotations
 
+import atexit
+import os
 import signal
+import sys
 import threading
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from types import FrameType
+
+from maxcon.cli import INTERRUPTED
+from maxcon.waiting import solver_at_work
 
 
 @contextmanager
@@ -28,11 +34,13 @@ def deferred() -> Iterator[threading.Event]:
         yield asked
     finally:
         signal.signal(signal.SIGINT, before)
+        if asked.is_set():
+            atexit.register(_leave)
 
 
 @contextmanager
 def noticed() -> Iterator[threading.Event]:
-    """Set the event on Ctrl-C, which interrupts as ever."""
+    """Set the event on Ctrl-C, which interrupts as ever; the process then ends without a solver that it has left."""
     asked = threading.Event()
 
     def note(_number: int, _frame: FrameType | None) -> None:
@@ -44,3 +52,14 @@ def noticed() -> Iterator[threading.Event]:
         yield asked
     finally:
         signal.signal(signal.SIGINT, before)
+        if asked.is_set():
+            atexit.register(_leave)
+
+
+def _leave() -> None:
+    """End the process here, on its way out, if a solver that Ctrl-C has left is still at work."""
+    if solver_at_work():
+        for stream in (sys.stdout, sys.stderr):
+            with suppress(OSError, ValueError):  # of a reader that is gone
+                stream.flush()
+        os._exit(INTERRUPTED)

@@ -103,8 +103,8 @@ def command(
 
     Lines and planes come from random instances of the paper's protocol.
 
-    DIR gets config.json, log.jsonl, TensorBoard events, checkpoint.pt and, at the end, agent.safetensors, which
-    `maxcon fit --method agent --option weights=FILE` and `maxcon evaluate --weights NAME=FILE` take. Ctrl-C
+    For an agent DIR gets config.json, log.jsonl, TensorBoard events, checkpoint.pt and, at the end, agent.safetensors,
+    which `maxcon fit --method agent --option weights=FILE` and `maxcon evaluate --weights NAME=FILE` take. Ctrl-C
     keeps the checkpoint. Where DIR holds a run, that run goes on, to the same end as if it had not been stopped.
 
     Fundamental matrices (d = 8) come from made scenes with 10 to 50% outliers, threshold 0.1, in the chart "auto". With
@@ -113,7 +113,10 @@ def command(
     No label is used anywhere.
 
     FAMILY "search" trains the two small networks of the method "learned", for all families at once, by imitation of the
-    best sets that anything has found, or with --learner optima of those that are proven to be the largest.
+    best sets that anything has found, or with --learner optima of those that are proven to be the largest. DIR gets
+    checkpoint.pt, from which it goes on as well, and after every round search.safetensors, which
+    `maxcon fit --method learned --option network=FILE` takes. It has no settings to change with --set, no --from and
+    no --paper.
 
     \b
     Examples:

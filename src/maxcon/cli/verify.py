@@ -2,18 +2,14 @@
 
 from __future__ import annotations
 
-import atexit
 import json
-import os
-import sys
-from contextlib import suppress
 from dataclasses import asdict
 
 import click
 from rich.text import Text
 
 from maxcon.certification import Certificate, CertificateError, VerificationReport, load, verify
-from maxcon.certification.rerun import load_solver, solver_at_work
+from maxcon.certification.rerun import load_solver
 from maxcon.cli import INTERRUPTED
 from maxcon.cli.errors import Failure
 from maxcon.cli.interrupt import deferred, noticed
@@ -100,8 +96,6 @@ def command(
         with noticed() as interrupted, console(stderr=True).status("checking ..."):
             report = verify(certificate, problem.A, problem.b, threshold=threshold, rerun=rerun, time_limit=time_limit)
         stopped = interrupted.is_set()
-        if stopped:
-            atexit.register(_leave)
     if json_out is not None:
         record = {"certificate": cert, "data": data, **asdict(report), "bound": report.bound}
         lines = [f"  {json.dumps(key)}: {json.dumps(plain(value))}" for key, value in record.items()]
@@ -122,15 +116,6 @@ def _load_solver() -> None:
         load_solver()
     if asked.is_set():
         raise click.Abort
-
-
-def _leave() -> None:
-    """End the process here, on its way out, if the solver that Ctrl-C has left is still at work."""
-    if solver_at_work():
-        for stream in (sys.stdout, sys.stderr):
-            with suppress(OSError, ValueError):  # of a reader that is gone
-                stream.flush()
-        os._exit(INTERRUPTED)
 
 
 def _load(cert: str) -> Certificate | str:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Iterator
+from functools import partial
 
 import numpy as np
 import scipy.optimize
@@ -18,6 +19,7 @@ from maxcon.search.anytime import Step, Task
 from maxcon.search.milp_box import ROUNDING, Box, Floats, model_box
 from maxcon.search.peel import peel
 from maxcon.search.sampling import check_count
+from maxcon.waiting import interruptible
 
 #: Seconds of the first call of HiGHS where there is no time limit, and how much longer each next one is.
 FIRST_SLICE, LONGER = 60.0, 2.0
@@ -80,7 +82,9 @@ def milp(
     Notes
     -----
     HiGHS cannot be interrupted; a time limit it keeps by itself. Without one it is called for a minute, and if
-    that is not enough for twice as long, and so on, always anew; between the calls Ctrl-C and callbacks are heard.
+    that is not enough for twice as long, and so on, always anew; callbacks are heard between the calls. Ctrl-C is heard
+    at once, and leaves HiGHS to its own in a thread, which ends with its call or with the process
+    (`maxcon.waiting.solver_at_work`).
     """
     given = None if box is None else _check_box(box, task.problem.n_params)
     if node_limit is not None:
@@ -188,13 +192,16 @@ class _Programme:
 
     def solve(self, seconds: float, node_limit: int | None) -> OptimizeResult:
         """Call HiGHS."""
-        return scipy.optimize.milp(
+        nodes = node_limit or np.iinfo(np.int32).max
+        solve = partial(
+            scipy.optimize.milp,
             self.weights,
             integrality=self.weights,
             bounds=self.bounds,
-            constraints=self.constraints,
-            options={"mip_rel_gap": 0.0, "time_limit": seconds, "node_limit": node_limit or np.iinfo(np.int32).max},
+            constraints=tuple(self.constraints),
+            options={"mip_rel_gap": 0.0, "time_limit": seconds, "node_limit": nodes},
         )
+        return interruptible(solve)
 
     def upper_bound(self, answer: OptimizeResult) -> int | None:
         """Return what HiGHS has proven of the consensus, if anything."""

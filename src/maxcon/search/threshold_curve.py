@@ -123,6 +123,10 @@ class ConsensusCurve(ReadOnlyArrays):
         before. Of several in a row the sharpest counts. Knees are at least a tenth of the points apart. Curves of
         data without a clear noise level have none.
 
+        They depend on the range that the curve was asked for: only its breakpoints are looked at, and none is a knee
+        that wins less than a tenth of all points within the range before it, or is the last. Those of an incomplete
+        curve are of `thresholds` as far as they are known.
+
         Raises
         ------
         ValueError

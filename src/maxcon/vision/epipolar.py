@@ -26,8 +26,11 @@ def check_points(value: ArrayLike, name: str) -> NDArray[np.float64]:
 
 
 def check_matches(x1: ArrayLike, x2: ArrayLike, least: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return matches as two arrays of shape (N, 2), N >= `least`; TypeError or ValueError otherwise."""
-    first, second = check_points(x1, "x1"), check_points(x2, "x2")
+    """Return matches as two arrays of shape (N, 2), N >= `least`; TypeError or ValueError otherwise.
+
+    OpenCV's points, of shape (N, 1, 2), are taken as well.
+    """
+    first, second = check_points(_flat(x1), "x1"), check_points(_flat(x2), "x2")
     if first.shape != second.shape:
         raise ValueError(
             f"x2 must have one row for each row of x1, shape {first.shape}, but its shape is {second.shape}"
@@ -35,6 +38,12 @@ def check_matches(x1: ArrayLike, x2: ArrayLike, least: int) -> tuple[NDArray[np.
     if len(first) < least:
         raise ValueError(f"x1 and x2 must hold at least {least} matches, but they hold {len(first)}")
     return first, second
+
+
+def _flat(points: Any) -> Any:
+    """Return points of shape (N, 1, 2) as of shape (N, 2), and anything else as it is."""
+    shape = np.shape(points) if isinstance(points, (np.ndarray, list, tuple)) and len(points) > 0 else ()
+    return np.asarray(points)[:, 0] if len(shape) == 3 and shape[1:] == (1, 2) else points
 
 
 def check_matrix(value: ArrayLike, name: str = "F") -> NDArray[np.float64]:

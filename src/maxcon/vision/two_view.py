@@ -151,7 +151,8 @@ def find_fundamental(
     Parameters
     ----------
     x1, x2
-        Shape (N, 2) each, N >= 9, in pixels: ``x1[i]`` of image 1 is matched to ``x2[i]`` of image 2.
+        Shape (N, 2) each, or OpenCV's (N, 1, 2), N >= 9, in pixels: ``x1[i]`` of image 1 is matched to ``x2[i]`` of
+        image 2.
     threshold
         The largest residual of an inlier: algebraic, in normalised coordinates, without a unit. The paper
         takes 0.1 for made scenes and 0.01, the default, for KITTI. What it means in pixels depends on the images;
