@@ -65,7 +65,10 @@ ROUNDS_OPEN = 24
 #: A set is yielded, or an empty step, about so often, in seconds; a set costs 10 us.
 PAUSE = 0.002
 
-#: The root of more than `MANY` points is that of a search on `COARSE` random ones, or a `COARSER`-th of the points if
+#: With fewer parameters than this many are more points, as the root takes time with the square of the rank.
+MANY_RANK = 9
+
+#: The root of many points is that of a search on `COARSE` random ones, or a `COARSER`-th of the points if
 #: that is more: rounds there until its belief agrees with its incumbent, at most so many, in at most this share of the
 #: time, but one at least on the fewest points.
 COARSE, COARSER, COARSE_ROUNDS, COARSE_SHARE = 200, 6, 8, 0.3
@@ -208,7 +211,7 @@ def _search(
         now = working_clock()
         if end - now <= BELIEF_PIECES * took[0]:
             pieces = []
-        else:
+        elif task.problem.n_points > _many(task.rows.At.shape[0]):
             begin_search_belief(arena, limit)
             now = working_clock()
     for number in cycle(range(len(pieces))):
@@ -250,7 +253,7 @@ def _root(task: Task, nets: SearchNetworks, settings: Settings) -> tuple[Arena, 
     N = task.problem.n_points
     sizes = [N]
     least = max(COARSE, COARSE_RANKS * task.rows.At.shape[0])
-    while sizes[-1] > max(MANY, 2 * least):
+    while sizes[-1] > max(_many(task.rows.At.shape[0]), 2 * least):
         sizes.append(max(sizes[-1] // COARSER, least))
     began, left, coarse, walk = working_clock(), task.seconds_left(), None, 0.0
     for size in reversed(sizes):
@@ -274,6 +277,11 @@ def _root(task: Task, nets: SearchNetworks, settings: Settings) -> tuple[Arena, 
             play_coarse_round(arena, task.limit, settings)
         coarse = arena
     return arena, walk
+
+
+def _many(d: int) -> float:
+    """Return beyond how many points the root begins with fewer."""
+    return MANY * max(1.0, (MANY_RANK / (d + 1)) ** 2)
 
 
 def _some(rows: LinearRows, points: NDArray[np.int64]) -> LinearRows:
