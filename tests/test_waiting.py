@@ -21,7 +21,7 @@ def test_what_it_returns_or_raises_arrives():
 
 
 @pytest.mark.skipif(os.name != "posix", reason="sends SIGINT")
-def test_ctrl_c_ends_the_wait():
+def test_ctrl_c_ends_the_wait(heard):
     done = threading.Event()
 
     def solver():

@@ -127,7 +127,7 @@ def test_called_again_for_longer_where_there_is_no_limit(monkeypatch):
 
 
 @pytest.mark.skipif(os.name != "posix", reason="sends SIGINT")
-def test_ctrl_c_leaves_the_solver_and_keeps_the_best(monkeypatch):
+def test_ctrl_c_leaves_the_solver_and_keeps_the_best(monkeypatch, heard):
     """HiGHS does not look up, here for ten seconds: what the short peel before it has found is returned at once."""
     done = threading.Event()
     solve = scipy.optimize.milp
