@@ -28,7 +28,6 @@ import json  # noqa: E402
 import platform  # noqa: E402
 import time  # noqa: E402
 from collections.abc import Sequence  # noqa: E402
-from contextlib import nullcontext  # noqa: E402
 from functools import partial  # noqa: E402
 from pathlib import Path  # noqa: E402
 from typing import Any, NamedTuple  # noqa: E402
@@ -285,7 +284,7 @@ def main() -> None:
             parser.error(f"--variants must be some of {', '.join(map(repr, table))}, not {unknown}")
         wanted = {SHIPPED, *options.variants, *(table[name].reference for name in options.variants)}
         table = {name: variant for name, variant in table.items() if name in wanted}
-    with processor_time() if options.cpu_time else nullcontext():
+    with processor_time(options.cpu_time):
         compare(table, options)
 
 

@@ -23,7 +23,6 @@ import gc  # noqa: E402
 import json  # noqa: E402
 import platform  # noqa: E402
 from collections.abc import Callable, Iterator  # noqa: E402
-from contextlib import nullcontext  # noqa: E402
 from pathlib import Path  # noqa: E402
 from typing import Any  # noqa: E402
 
@@ -134,7 +133,7 @@ def main() -> None:
     parser.add_argument("--cpu-time", action="store_true", help="the processor's time: for a shared machine")
     parser.add_argument("--out", type=Path, default=None, help="write all records there, JSON")
     options = parser.parse_args()
-    with processor_time() if options.cpu_time else nullcontext():
+    with processor_time(options.cpu_time):
         compare(options)
 
 

@@ -63,7 +63,6 @@ from maxcon.problem import LinearProblem  # noqa: E402
 from maxcon.search import learned as method  # noqa: E402
 from maxcon.search.anytime import Task, make_task  # noqa: E402
 from maxcon.search.belief import MOST_LACK, TEMPERATURES  # noqa: E402
-from maxcon.search.belief_proposals import MANY  # noqa: E402
 from maxcon.search.learned_kernels import (  # noqa: E402
     WALK_INCUMBENT,
     begin_search,
@@ -107,9 +106,7 @@ def play_fit(problem: LinearProblem, threshold: float, rounds: int, log: Log) ->
     task = make_task(fresh, threshold, np.random.default_rng(0))
     log(AGAIN, 0)
     N = fresh.n_points
-    sizes = [N]
-    while sizes[-1] > MANY:
-        sizes.append(max(sizes[-1] // method.COARSER, method.COARSE))
+    sizes = method.sizes_of(task.rows)
     coarse = None
     for size in reversed(sizes):
         level = "" if size == N else f", {size} points"

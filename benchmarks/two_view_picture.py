@@ -38,7 +38,7 @@ import gc  # noqa: E402
 import platform  # noqa: E402
 import textwrap  # noqa: E402
 from collections.abc import Callable, Sequence  # noqa: E402
-from contextlib import nullcontext, suppress  # noqa: E402
+from contextlib import suppress  # noqa: E402
 from dataclasses import dataclass, replace  # noqa: E402
 from pathlib import Path  # noqa: E402
 from typing import TYPE_CHECKING, Any  # noqa: E402
@@ -325,7 +325,7 @@ def parse() -> argparse.Namespace:
 
 def main() -> None:
     options = parse()
-    with processor_time() if options.cpu_time else nullcontext():
+    with processor_time(options.cpu_time):
         compare_on_pairs(options)
 
 

@@ -8,23 +8,12 @@ from pathlib import Path
 import pytest
 
 import maxcon
+from test_layers import CORE
 
 PACKAGE = Path(maxcon.__file__).parent
 HEAVY = ("numba", "torch", "scipy", "matplotlib", "sklearn", "cv2", "gymnasium")
 
 
-CORE = {
-    "waiting",
-    "problem",
-    "datasets",
-    "minimax",
-    "tree",
-    "agent",
-    "search",
-    "certification",
-    "fitting",
-    "certifying",
-}
 NEEDS_EXTRAS = {
     "tree/environments.py",
     "tree/registration.py",

@@ -19,9 +19,10 @@ from maxcon.search.learned_kernels import (
 )
 from maxcon.search.learned_memory import IN_WINDOW, SIZE, SWAPPED, WHOLLY, allocate_arena, carve
 from maxcon.search.learned_settings import Settings
+from maxcon.search.peel_walk import walk_workspace
 from maxcon.search.random_kernels import seed_state
 from maxcon.search.refine_kernels import allocate_refinement, refine_kernel, swap_by, swap_kernel
-from maxcon.search.window import CORE, OUTER, choose_window, window_scratch, window_workspace
+from maxcon.search.window import CORE, OUTER, choose_window, window_scratch
 
 
 def search_on(A, b, threshold):
@@ -82,7 +83,7 @@ def test_scratch_space_of_a_window_serves_its_swap():
     for cut in (False, True):
         if cut:
             search.walk.points[:m] = np.arange(m)
-            window = window_workspace(3, m, search.walk)
+            window = walk_workspace(3, m, search.walk)
             window.At[:], window.b[:] = task.rows.At[:, :m], task.rows.b[:m]
             scratch = window_scratch(m, search.refinement)
         else:

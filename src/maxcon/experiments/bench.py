@@ -14,7 +14,6 @@ import inspect
 import os
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager, nullcontext
 from dataclasses import asdict, dataclass, replace
 from importlib import import_module
 from typing import Any
@@ -237,7 +236,7 @@ def _calibrate(work: tuple[Settings, Cell]) -> tuple[str, dict[str, Any]]:
     instances = [make_instance(cell, number, settings.seed, CALIBRATION) for number in range(settings.calibration)]
     found = {}
     for peer in peers_for(cell.family, settings.methods):
-        with _clock(settings):
+        with processor_time(settings.cpu_time):
             best = calibrate(peer, instances, [1e-3 * budget for budget in settings.budgets])
         found[peer.name] = {f"{1e3 * budget:g}": asdict(choice) for budget, choice in best.items()}
     return cell.name, found
@@ -250,7 +249,7 @@ def _run(work: _Work) -> Unit:
     ours = [name for name in settings.methods if name not in peer_names()]
     unserved = {name: reason for name in ours if (reason := _reason(name, work.cell.family)) is not None}
     served = [name for name in ours if name not in unserved]
-    with _clock(settings):
+    with processor_time(settings.cpu_time):
         _warm_ours(work.cell, tuple(served), settings.budgets)
         _warm_peers(work.cell.family, settings.methods)
         began, worked = time.perf_counter(), time.process_time()
@@ -297,10 +296,6 @@ def _rows(work: _Work, instance: Instance, served: Sequence[str]) -> list[Row]:
                 found[name] = our_row(instance, name, budget, settings.seeds)
         rows += [found[name] for name in names]
     return rows
-
-
-def _clock(settings: Settings) -> AbstractContextManager[None]:
-    return processor_time() if settings.cpu_time else nullcontext()
 
 
 def our_row(instance: Instance, name: str, budget: float, seeds: int) -> Row:

@@ -166,9 +166,10 @@ def run(
                     best.subset, best.size, news = subset, size, True
                     if step.path is not None:
                         best.path = step.path
-            seconds = working_clock() - began
-            if callback is not None and news and callback(Progress(best.size, best.upper_bound, seconds)):
-                break
+            if callback is not None and news:
+                seconds = working_clock() - began
+                if callback(Progress(best.size, best.upper_bound, seconds)):
+                    break
             if (best.subset is not None and best.gap <= task.gap) or task.over():
                 break
     except KeyboardInterrupt:

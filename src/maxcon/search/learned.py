@@ -211,7 +211,7 @@ def _search(
         now = working_clock()
         if end - now <= BELIEF_PIECES * took[0]:
             pieces = []
-        elif task.problem.n_points > _many(task.rows.At.shape[0]):
+        elif len(sizes_of(task.rows)) > 1:
             begin_search_belief(arena, limit)
             now = working_clock()
     for number in cycle(range(len(pieces))):
@@ -251,12 +251,8 @@ def _root(task: Task, nets: SearchNetworks, settings: Settings) -> tuple[Arena, 
     And the seconds that a walk from its incumbent may take, by what one took on fewer points.
     """
     N = task.problem.n_points
-    sizes = [N]
-    least = max(COARSE, COARSE_RANKS * task.rows.At.shape[0])
-    while sizes[-1] > max(_many(task.rows.At.shape[0]), 2 * least):
-        sizes.append(max(sizes[-1] // COARSER, least))
     began, left, coarse, walk = working_clock(), task.seconds_left(), None, 0.0
-    for size in reversed(sizes):
+    for size in reversed(sizes_of(task.rows)):
         rows = task.rows if size == N else _some(task.rows, task.rng.choice(N, size, replace=False))
         arena = allocate_arena(rows, seed_state(task.rng), nets.points, nets.peel)
         counts = arena.integers[:N_COUNTS]
@@ -279,9 +275,13 @@ def _root(task: Task, nets: SearchNetworks, settings: Settings) -> tuple[Arena, 
     return arena, walk
 
 
-def _many(d: int) -> float:
-    """Return beyond how many points the root begins with fewer."""
-    return MANY * max(1.0, (MANY_RANK / (d + 1)) ** 2)
+def sizes_of(rows: LinearRows) -> list[int]:
+    """Return of how many points the searches are that a root takes: of all, and before that of ever fewer."""
+    r, N = rows.At.shape
+    sizes, least = [N], max(COARSE, COARSE_RANKS * r)
+    while sizes[-1] > max(MANY * max(1.0, (MANY_RANK / (r + 1)) ** 2), 2 * least):
+        sizes.append(max(sizes[-1] // COARSER, least))
+    return sizes
 
 
 def _some(rows: LinearRows, points: NDArray[np.int64]) -> LinearRows:

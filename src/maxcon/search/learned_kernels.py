@@ -35,11 +35,11 @@ from maxcon.search.learned_memory import (
 )
 from maxcon.search.learned_settings import Settings
 from maxcon.search.model_kernels import count_within, weighted_model
-from maxcon.search.peel_walk import choose_start, copy_rows, install_walk, walk_down
+from maxcon.search.peel_walk import choose_start, copy_rows, install_walk, walk_down, walk_workspace
 from maxcon.search.random_kernels import draw_next, random_below, random_unit
 from maxcon.search.refine_kernels import refine_by, swap_by, swap_kernel
 from maxcon.search.vertex_kernels import load_vertex, save_vertex
-from maxcon.search.window import CORE, NEAR_MISS, OUTER, SWAP_TRIES, choose_window, window_scratch, window_workspace
+from maxcon.search.window import CORE, NEAR_MISS, OUTER, SWAP_TRIES, choose_window, window_scratch
 
 #: The parts of a round, in order; walks 0 and 1 start from proposals, 2 from the incumbent, the rest from variations.
 PROPOSE, WALK, WALK_INCUMBENT, VARY, BELIEVE, SWAP, PARTS = 0, 1, 3, 4, 5, 6, 7
@@ -192,7 +192,7 @@ def _refine_window(search: Search, limit: float, m: int, size: int, below: int, 
     The walk's set has `size` points in the window and `below` that are not.
     """
     to_beat = search.counts[SIZE] - below
-    ws = window_workspace(search.ws.At.shape[0], m, search.walk)
+    ws = walk_workspace(search.ws.At.shape[0], m, search.walk)
     compute_residuals(ws.At, ws.b, ws.x, ws.r)
     if 10 * (count_within(ws.r, limit) + below) < 9 * search.counts[SIZE] - 10:  # too far off, as in `_take_walk`
         return False

@@ -75,21 +75,10 @@ def choose_start(r: NDArray[np.float64], reach: float, points: NDArray[np.int64]
 
 
 @kernel
-def copy_rows(At: NDArray[np.float64], b: NDArray[np.float64], m: int, walk: Walk) -> Workspace:
-    """Return a workspace of the rows of ``walk.points[:m]``, all of them in the fit."""
-    d = At.shape[0]
-    rows = walk.At[: d * m].reshape(d, m)
-    points = walk.points
-    for j in range(d):
-        a, target = At[j], rows[j]
-        for k in range(m):
-            target[k] = a[points[k]]
-    for k in range(m):
-        walk.b[k] = b[points[k]]
-        walk.gain[k] = 1.0
-        walk.cap[k] = 0.0
+def walk_workspace(d: int, m: int, walk: Walk) -> Workspace:
+    """Return the workspace of the m points of a walk."""
     return Workspace(
-        rows,
+        walk.At[: d * m].reshape(d, m),
         walk.b[:m],
         walk.gain[:m],
         walk.cap[:m],
@@ -100,6 +89,22 @@ def copy_rows(At: NDArray[np.float64], b: NDArray[np.float64], m: int, walk: Wal
         walk.work,
         walk.table,
     )
+
+
+@kernel
+def copy_rows(At: NDArray[np.float64], b: NDArray[np.float64], m: int, walk: Walk) -> Workspace:
+    """Return a workspace of the rows of ``walk.points[:m]``, all of them in the fit."""
+    ws = walk_workspace(At.shape[0], m, walk)
+    points = walk.points
+    for j in range(At.shape[0]):
+        a, target = At[j], ws.At[j]
+        for k in range(m):
+            target[k] = a[points[k]]
+    for k in range(m):
+        ws.b[k] = b[points[k]]
+        ws.gain[k] = 1.0
+        ws.cap[k] = 0.0
+    return ws
 
 
 @kernel

@@ -189,8 +189,9 @@ def _long(task: Task, left: float, n_jobs: int, search: Method) -> Iterator[Step
 
 def _larger(best: NDArray[np.bool_], step: Step) -> NDArray[np.bool_]:
     """Return the set of a step if it is larger than the best, else that."""
-    more = step.subset is not None and np.count_nonzero(step.subset) > np.count_nonzero(best)
-    return step.subset if step.subset is not None and more else best
+    if step.subset is None or np.count_nonzero(step.subset) <= np.count_nonzero(best):
+        return best
+    return step.subset
 
 
 def _refined(task: Task, best: NDArray[np.bool_]) -> NDArray[np.bool_]:

@@ -10,9 +10,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from maxcon.minimax import Workspace
 from maxcon.minimax.jit import kernel
-from maxcon.search.peel_walk import Walk
 from maxcon.search.refine_kernels import RefineScratch
 from maxcon.search.vertex_kernels import VertexCopies
 
@@ -37,23 +35,6 @@ def choose_window(r: NDArray[np.float64], core: float, outer: float, points: NDA
         m += (size >= core) & (size <= outer)
         below += size < core
     return m, below
-
-
-@kernel
-def window_workspace(d: int, m: int, walk: Walk) -> Workspace:
-    """Return the workspace of the m points of a walk."""
-    return Workspace(
-        walk.At[: d * m].reshape(d, m),
-        walk.b[:m],
-        walk.gain[:m],
-        walk.cap[:m],
-        walk.C,
-        walk.x,
-        walk.q,
-        walk.r[:m],
-        walk.work,
-        walk.table,
-    )
 
 
 @kernel
